@@ -1,0 +1,51 @@
+"""The family as data: MATD3, MADDPG, IL-TD3, IDDPG, TD3 and DDPG are points of one space."""
+
+import dataclasses
+from typing import Literal, NamedTuple
+
+import chex
+
+
+@dataclasses.dataclass(frozen=True)
+class Algorithm:
+    """What fixes the shape of a learner: static, hashable, one for each team."""
+
+    name: str = "matd3"
+    joint: bool = False
+    """One agent acts in the whole team's place (TD3, DDPG)."""
+    critic: Literal["central", "own"] = "central"
+    """"central": the critics see the joint observation and all actions; "own": the agent's own parts only."""
+    num_critics: int = 2
+    """The target takes the minimum over that many target critics; the actor climbs the first."""
+    policy_delay: int = 2
+    """Actor and targets move with every policy_delay-th update (d in the paper)."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Widths of the hidden ReLU layers of actor and critics."""
+    clip: Literal["variable", "network", "none"] = "variable"
+    """Gradient clipping by the norm of each variable on its own, of each network, or not at all."""
+    adam: Literal["standard", "epsilon_hat"] = "standard"
+    """"epsilon_hat": epsilon outside the bias correction, as TensorFlow 1 has it."""
+    smoothing: bool = False
+    """Add clipped Gaussian noise to the targets' actions (target policy smoothing)."""
+    sync_targets: bool = True
+    """Targets start as copies of the online networks; False: as independent draws, as in the authors' program."""
+
+
+class HyperParams(NamedTuple):
+    """What may differ between runs of one compiled program: one number each, or one per run along a leading axis."""
+
+    actor_lr: chex.Array | float
+    critic_lr: chex.Array | float
+    gamma: chex.Array | float
+    """Discount of one env step."""
+    tau: chex.Array | float
+    """Share of the online networks that a target takes on at each of its updates."""
+    target_noise: chex.Array | float
+    """Standard deviation of the smoothing noise; for Box actions in units of the half range."""
+    target_noise_clip: chex.Array | float
+    """Bound of the smoothing noise, in the same units."""
+    exploration_noise: chex.Array | float
+    """Standard deviation of the noise added to Box actions while collecting, in units of the half range."""
+    logit_regulariser: chex.Array | float
+    """Weight of the mean squared actor output (logits, or the number before the squashing) in the actor loss."""
+    max_grad_norm: chex.Array | float

@@ -1,0 +1,80 @@
+"""Set the machine up before JAX starts, and say what it is."""
+
+import importlib.metadata
+import os
+import platform
+from pathlib import Path
+
+import jax
+import psutil
+
+PACKAGES = ("matd3_jax", "jax", "jaxlib", "flax", "optax", "chex", "orbax-checkpoint", "numpy")
+
+
+def prepare() -> None:
+    """One CPU device per core (seeds are sharded over them) and a compilation cache that outlives the process.
+
+    Leaves alone what the user has set: `JAX_NUM_CPU_DEVICES`, `JAX_COMPILATION_CACHE_DIR`. Too late, and without
+    effect, once JAX has computed something: a library user's own devices stand.
+    """
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ and jax.config.jax_compilation_cache_dir is None:
+        home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+        jax.config.update("jax_compilation_cache_dir", str(home / "matd3_jax"))
+    if "JAX_NUM_CPU_DEVICES" in os.environ or "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
+        return
+    try:
+        jax.config.update(
+            "jax_num_cpu_devices", len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        )
+    except RuntimeError:
+        pass
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def description() -> dict[str, object]:
+    """The machine and JAX's devices."""
+    devices = jax.devices()
+    return {
+        "devices": [f"{d.platform}:{d.id} {d.device_kind}" for d in devices],
+        "processor": processor(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),
+        "system": platform.platform(),
+    }
+
+
+def processor() -> str:
+    """The CPU's model name."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def free_memory() -> int:
+    """Bytes that arrays may take up on JAX's devices together: the accelerators' limits, or what the machine (and the
+    control group, in a container) has free."""
+    devices = jax.local_devices()
+    if devices[0].platform != "cpu":
+        stats = [d.memory_stats() or {} for d in devices]
+        limits = [s["bytes_limit"] - s.get("bytes_in_use", 0) for s in stats if "bytes_limit" in s]
+        if limits:
+            return sum(limits)
+    free = psutil.virtual_memory().available
+    group = Path("/sys/fs/cgroup")
+    try:
+        limit = int((group / "memory.max").read_text())
+        return min(free, limit - int((group / "memory.current").read_text()))
+    except (OSError, ValueError):
+        return free

@@ -1,0 +1,150 @@
+"""Actors and critics. The members of a group, and the twin critics of each, are one batched network."""
+
+import math
+from collections.abc import Sequence
+
+import chex
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from matd3_jax.envs.base import ActionSpace, Box, Discrete, Simplex
+
+
+class StackedMLP(nn.Module):
+    """A stack of independent ReLU perceptrons with linear outputs, computed as batched products.
+
+    Every parameter has the stack's axes in front: kernels [*stack, inputs, outputs], biases [*stack, outputs]. Weights
+    are Glorot uniform (each network's own fans), biases zero: PAPER appendix and the authors' program.
+    """
+
+    stack: tuple[int, ...]
+    features: tuple[int, ...]
+    """Widths of the hidden layers and of the output."""
+
+    @nn.compact
+    def __call__(self, x: chex.Array, correction: tuple[chex.Array, Sequence[int]] | None = None) -> chex.Array:
+        """Outputs [*stack, batch, features[-1]].
+
+        Args:
+            x: [*leading, batch, inputs], where `leading` is the stack's axes or its first few: networks along the
+                axes left out read the same input, and their first layers are one wide product.
+            correction: (delta [*stack, batch, k], starts): added to the inputs `starts[m] : starts[m] + k` of the
+                networks at place m of the first stack axis. Equal to changing x there, but a gradient with respect
+                to delta costs k columns instead of all.
+        """
+        axes = tuple(range(len(self.stack)))
+        glorot = nn.initializers.glorot_uniform(batch_axis=axes)
+        inputs = x.shape[-1]
+        for layer, width in enumerate(self.features):
+            kernel = self.param(f"kernel_{layer}", glorot, (*self.stack, inputs, width))
+            bias = self.param(f"bias_{layer}", nn.initializers.zeros, (*self.stack, width))
+            y = _product(x, kernel)
+            if layer == 0 and correction is not None:
+                delta, starts = correction
+                k = delta.shape[-1]
+                columns = jnp.stack([kernel[m, ..., start : start + k, :] for m, start in enumerate(starts)])
+                y = y + delta @ columns
+            y = y + bias[..., None, :]
+            x = y if layer == len(self.features) - 1 else nn.relu(y)
+            inputs = width
+        return x
+
+
+def _product(x: chex.Array, kernel: chex.Array) -> chex.Array:
+    """x [*leading, batch, i] times kernel [*leading, *rest, i, j]: [*leading, *rest, batch, j], as one product of
+    width rest x j for each of `leading`."""
+    leading = x.ndim - 2
+    rest = kernel.shape[leading:-2]
+    if not rest:
+        return x @ kernel
+    i, j = kernel.shape[-2:]
+    wide = jnp.moveaxis(kernel.reshape(*kernel.shape[:leading], math.prod(rest), i, j), -3, -2)
+    y = x @ wide.reshape(*kernel.shape[:leading], i, math.prod(rest) * j)
+    y = y.reshape(*y.shape[:-1], math.prod(rest), j)
+    return jnp.moveaxis(y, -2, -3).reshape(*kernel.shape[:leading], *rest, *x.shape[leading:-1], j)
+
+
+def actor_network(members: int, hidden: tuple[int, ...], space: ActionSpace) -> StackedMLP:
+    """Actors [members]: observations [members, batch, size] to outputs [members, batch, action size]."""
+    return StackedMLP((members,), (*hidden, space.size))
+
+
+def critic_network(members: int, num_critics: int, hidden: tuple[int, ...]) -> StackedMLP:
+    """Critics [members, num_critics]: inputs [(members,) batch, size] to values [members, num_critics, batch, 1]."""
+    return StackedMLP((members, num_critics), (*hidden, 1))
+
+
+# ---- actions from actor outputs --------------------------------------------------------------------------------------
+
+
+def noise(key: chex.PRNGKey, space: ActionSpace, shape: tuple[int, ...]) -> chex.Array:
+    """The noise that `act` takes for one space, [*shape, space.size]: Gumbel for choices, standard normal for a Box."""
+    draw = jax.random.normal if isinstance(space, Box) else jax.random.gumbel
+    return draw(key, (*shape, space.size))
+
+
+def policy_noise(key: chex.PRNGKey, space: ActionSpace, shape: tuple[int, ...]) -> chex.Array | None:
+    """The noise of the policy itself, without exploration: Gumbel for choices, none for a Box (deterministic policy)."""
+    return None if isinstance(space, Box) else noise(key, space, shape)
+
+
+def act(space: ActionSpace, output: chex.Array, draw: chex.Array | None, scale: chex.Array | float = 0.0) -> chex.Array:
+    """Action vectors [..., space.size] from actor outputs [..., space.size].
+
+    Choices: softmax(logits + Gumbel noise) at temperature 1 for each part, soft as it is for a `Simplex`; one-hot with
+    the soft sample's gradient (straight-through) for hard choices. Box: low + (high - low) sigmoid(output), plus
+    `scale` half ranges of Gaussian noise, kept inside the Box.
+
+    Args:
+        draw: noise as from `noise`; None for the deterministic action (no noise: softmax(logits), the likeliest
+            choice, or the squashed output).
+        scale: standard deviation of the Gaussian noise in half ranges; only for a Box.
+    """
+    if isinstance(space, Box):
+        half = (space.high - space.low) / 2
+        action = space.low + 2 * half * jax.nn.sigmoid(output)
+        if draw is None:
+            return action
+        return jnp.clip(action + scale * half * draw, space.low, space.high)
+    logits = output if draw is None else output + draw
+    return jnp.concatenate([_choose(part, isinstance(space, Simplex)) for part in split(logits, space)], axis=-1)
+
+
+def random_action(key: chex.PRNGKey, space: ActionSpace, shape: tuple[int, ...]) -> chex.Array:
+    """Action vectors [*shape, space.size] drawn uniformly: from the Box, or by zero logits."""
+    if isinstance(space, Box):
+        return jax.random.uniform(key, (*shape, space.size), minval=space.low, maxval=space.high)
+    return act(space, jnp.zeros((*shape, space.size)), noise(key, space, shape))
+
+
+def smooth(space: ActionSpace, action: chex.Array, draw: chex.Array, sigma: chex.Array, clip: chex.Array) -> chex.Array:
+    """Target policy smoothing (PAPER eq. for y_i): action + clip(sigma * draw, -clip, clip), in half ranges and kept
+    inside a Box; for choices added to the vectors without projecting back, as in the authors' program."""
+    epsilon = jnp.clip(sigma * draw, -clip, clip)
+    if isinstance(space, Box):
+        return jnp.clip(action + epsilon * (space.high - space.low) / 2, space.low, space.high)
+    return action + epsilon
+
+
+def split(vector: chex.Array, space: ActionSpace) -> list[chex.Array]:
+    """The parts of a vector of several choices, each [..., size of the part]."""
+    assert not isinstance(space, Box)
+    ends = [sum(space.sizes[: i + 1]) for i in range(len(space.sizes))]
+    return [vector[..., end - size : end] for end, size in zip(ends, space.sizes, strict=True)]
+
+
+def _choose(logits: chex.Array, soft: bool) -> chex.Array:
+    sample = jax.nn.softmax(logits)
+    if soft:
+        return sample
+    hard = jax.nn.one_hot(jnp.argmax(sample, -1), sample.shape[-1], dtype=sample.dtype)
+    return hard + sample - jax.lax.stop_gradient(sample)
+
+
+def to_env(space: ActionSpace, action: chex.Array) -> chex.Array:
+    """What `Environment.step` takes for an action vector: the vector, or the number(s) of hard choices."""
+    if isinstance(space, Box | Simplex):
+        return action
+    chosen = [jnp.argmax(part, -1).astype(jnp.int32) for part in split(action, space)]
+    return chosen[0] if isinstance(space, Discrete) else jnp.stack(chosen, -1)

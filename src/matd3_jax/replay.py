@@ -1,0 +1,39 @@
+"""Experience replay: a ring of flat transition rows for every seed, on the device.
+
+Rows are [seeds, capacity, row_size]. All seeds write equally much at the same time, so the write position is one number
+for all of them, derived from the count of collects: a write is one contiguous slice update with an explicit seed axis
+(under `vmap` it would turn into a scatter), and a batch is one gather.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+
+
+def allocate(num_seeds: int, capacity: int, row_size: int) -> chex.Array:
+    """An empty replay: zeros [seeds, capacity, row_size]."""
+    return jnp.zeros((num_seeds, capacity, row_size), jnp.float32)
+
+
+def write(rows: chex.Array, new: chex.Array, count: chex.Array) -> chex.Array:
+    """Write the rows `new` [seeds, n, row_size] of collect number `count` (from 0); n divides the capacity, so that no
+    write wraps."""
+    capacity, n = rows.shape[1], new.shape[1]
+    if capacity % n:
+        raise ValueError(f"replay capacity {capacity} is not a multiple of the {n} rows of one write")
+    return jax.lax.dynamic_update_slice(rows, new, (0, count % (capacity // n) * n, 0))
+
+
+def filled(capacity: int, n: int, count: chex.Array) -> chex.Array:
+    """Number of valid rows after `count` writes of n rows each."""
+    return jnp.minimum(count, capacity // n) * n
+
+
+def sample_indices(key: chex.PRNGKey, size: chex.Array, shape: tuple[int, ...]) -> chex.Array:
+    """Row numbers, uniform on [0, size) and independent (with replacement), int32 [*shape]."""
+    return jax.random.randint(key, shape, 0, size)
+
+
+def gather(rows: chex.Array, seed: chex.Array, indices: chex.Array) -> chex.Array:
+    """The rows [*indices.shape, row_size] of one seed."""
+    return rows.at[seed, indices].get(mode="promise_in_bounds")

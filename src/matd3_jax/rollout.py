@@ -1,0 +1,161 @@
+"""Act in the environment: collect transitions for the replay, and evaluate policies. For one seed; `vmap` for more."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from matd3_jax import learner, networks
+from matd3_jax.algorithms import HyperParams
+from matd3_jax.envs.base import Environment
+from matd3_jax.spec import Spec
+
+
+class EnvState(NamedTuple):
+    """The environments of one seed, mid-episode; leading axis [num_envs]."""
+
+    state: Any
+    observation: tuple[chex.Array, ...]
+    episode_return: chex.Array
+    """[num_envs, num_agents] reward gathered so far in the running episodes."""
+    episode_step: chex.Array
+    """[num_envs] env steps so far in the running episodes."""
+
+
+class Episodes(NamedTuple):
+    """Sums over the episodes that ended in a stretch of play."""
+
+    count: chex.Array
+    episode_return: chex.Array
+    """[num_agents] undiscounted."""
+    length: chex.Array
+
+
+def start(env: Environment, key: chex.PRNGKey, num_envs: int) -> EnvState:
+    """Fresh episodes in `num_envs` environments."""
+    state, observation = jax.vmap(env.reset)(jax.random.split(key, num_envs))
+    return EnvState(state, observation, jnp.zeros((num_envs, len(env.agents))), jnp.zeros(num_envs, jnp.int32))
+
+
+def collect(
+    env: Environment,
+    spec: Spec,
+    actors: Sequence[chex.ArrayTree],
+    hyper: Sequence[HyperParams],
+    env_state: EnvState,
+    key: chex.PRNGKey,
+    length: int,
+    random: bool = False,
+) -> tuple[EnvState, chex.Array, Episodes]:
+    """Play `length` steps in every environment with the exploring policies; episodes that end start anew.
+
+    Returns the environments, the replay rows [length * num_envs, row_size] (the true next observation in them, also
+    where an episode ended) and what ended on the way.
+
+    Args:
+        actors: actor parameters, one stack per group.
+        random: act uniformly at random instead: warm-up without the policies.
+    """
+    num_envs = env_state.episode_step.shape[0]
+    noise_key, step_key, reset_key = jax.random.split(key, 3)
+    # All noise of the stretch in one draw for each group, not one for each step.
+    noise = _noise(spec, noise_key, (length, num_envs), random)
+
+    def step(carry: EnvState, inputs):
+        draws, step_keys, reset_keys = inputs
+        action = spec.join_actions(draws) if random else act(spec, actors, hyper, carry.observation, draws)
+        after = jax.vmap(env.step)(step_keys, carry.state, env_actions(spec, action))
+        x, next_x = (jnp.concatenate(o, axis=-1) for o in (carry.observation, after.observation))
+        rows = spec.pack_rows(x, action, after.reward, next_x, after.terminated)
+        returns = carry.episode_return + after.reward
+        steps = carry.episode_step + 1
+        ended = after.terminated | after.truncated
+        episodes = Episodes(
+            ended.sum(), jnp.where(ended[:, None], returns, 0).sum(axis=0), jnp.where(ended, steps, 0).sum()
+        )
+        fresh = jax.vmap(env.reset)(reset_keys)
+        state, observation = jax.tree.map(
+            lambda new, old: jnp.where(ended.reshape(ended.shape + (1,) * (old.ndim - 1)), new, old),
+            fresh,
+            (after.state, after.observation),
+        )
+        carry = EnvState(state, observation, jnp.where(ended[:, None], 0, returns), jnp.where(ended, 0, steps))
+        return carry, (rows, episodes)
+
+    keys = jax.random.split(step_key, (length, num_envs)), jax.random.split(reset_key, (length, num_envs))
+    env_state, (rows, episodes) = jax.lax.scan(step, env_state, (noise, *keys))
+    return env_state, rows.reshape(length * num_envs, -1), jax.tree.map(lambda e: e.sum(axis=0), episodes)
+
+
+def evaluate(
+    env: Environment,
+    spec: Spec,
+    actors: Sequence[chex.ArrayTree],
+    hyper: Sequence[HyperParams],
+    key: chex.PRNGKey,
+    episodes: int,
+    deterministic: bool,
+) -> tuple[chex.Array, chex.Array]:
+    """Undiscounted returns [episodes, num_agents] and lengths [episodes] of whole episodes, each in its own environment.
+
+    deterministic: no noise at all (softmax of the logits, likeliest choice, squashed output); otherwise the policies
+    act as they do while collecting.
+    """
+    state_key, step_key = jax.random.split(key)
+    env_state = start(env, state_key, episodes)
+
+    def step(carry, key):
+        env_state, running = carry
+        act_key, env_key = jax.random.split(key)
+        draws = None
+        if not deterministic:
+            draws = _noise(spec, act_key, (episodes,))
+        actions = env_actions(spec, act(spec, actors, hyper, env_state.observation, draws))
+        after = jax.vmap(env.step)(jax.random.split(env_key, episodes), env_state.state, actions)
+        env_state = EnvState(
+            after.state,
+            after.observation,
+            env_state.episode_return + jnp.where(running[:, None], after.reward, 0),
+            env_state.episode_step + running,
+        )
+        return (env_state, running & ~(after.terminated | after.truncated)), None
+
+    carry = (env_state, jnp.ones(episodes, bool))
+    (env_state, _), _ = jax.lax.scan(step, carry, jax.random.split(step_key, env.episode_length))
+    return env_state.episode_return, env_state.episode_step
+
+
+def act(
+    spec: Spec,
+    actors: Sequence[chex.ArrayTree],
+    hyper: Sequence[HyperParams],
+    observation: Sequence[chex.Array],
+    draws: Sequence[chex.Array] | None,
+) -> chex.Array:
+    """Joint actions [envs, action_size] for one observation [envs, size] per agent.
+
+    draws: noise [members, envs, action size] per group (see `networks.noise`); None: deterministic actions.
+    """
+    parts = []
+    for g, group in enumerate(spec.groups):
+        stacked = jnp.stack([observation[i] for i in group.members])
+        output = learner.apply(learner.actor_of(group), actors[g], stacked)
+        draw = None if draws is None else draws[g]
+        parts.append(networks.act(group.action_space, output, draw, hyper[g].exploration_noise))
+    return spec.join_actions(parts)
+
+
+def env_actions(spec: Spec, action: chex.Array) -> tuple[chex.Array, ...]:
+    """What `Environment.step` takes, of joint action vectors [..., action_size]."""
+    return tuple(networks.to_env(space, spec.action_part(action, i)) for i, space in enumerate(spec.action_spaces))
+
+
+def _noise(spec: Spec, key: chex.PRNGKey, shape: tuple[int, ...], random: bool = False) -> tuple[chex.Array, ...]:
+    """Noise [*shape[:-1], members, shape[-1], action size] of every group; `random`: whole random actions instead."""
+    draw = networks.random_action if random else networks.noise
+    return tuple(
+        draw(jax.random.fold_in(key, g), group.action_space, (*shape[:-1], len(group.members), shape[-1]))
+        for g, group in enumerate(spec.groups)
+    )

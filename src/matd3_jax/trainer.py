@@ -1,0 +1,302 @@
+"""The loop: rollout, replay and updates of many seeds inside one `lax.scan`, the seeds sharded over devices."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
+from typing import NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+from matd3_jax import learner, replay, rollout
+from matd3_jax.algorithms import HyperParams
+from matd3_jax.envs.base import Environment
+from matd3_jax.learner import GroupState, UpdateMetrics
+from matd3_jax.rollout import EnvState, Episodes
+from matd3_jax.spec import Spec
+
+
+@dataclasses.dataclass(frozen=True)
+class Schedule:
+    """How play and learning alternate: static.
+
+    Collect `num_envs * rollout_length` env steps, then `updates_per_collect` updates; actors and targets move with
+    every policy_delay-th update. The unit that the scan repeats (a cycle) is the shortest stretch of whole collects
+    that holds every algorithm's delay a whole number of times, so that the delay is structure and not a condition.
+    """
+
+    num_envs: int = 4
+    rollout_length: int = 25
+    updates_per_collect: int = 1
+    batch_size: int = 1024
+    replay_capacity: int = 1_000_000
+    """Transitions a seed; a multiple of `collect_steps`."""
+    learning_starts: int = 25_600
+    """Transitions in the replay at the first update."""
+    warmup: str = "policy"
+    """Before that, "policy": the untrained policies act; "random": uniform actions."""
+    shared_minibatch: bool = False
+    """One minibatch (and one set of target actions) for all agents instead of one each."""
+    sequential: bool = False
+    """Update the agents one after another (see `learner.update`)."""
+
+    @property
+    def collect_steps(self) -> int:
+        """Env steps of one collect."""
+        return self.num_envs * self.rollout_length
+
+    @property
+    def prefill_collects(self) -> int:
+        """Collects before the loop: the first collect of the loop then reaches `learning_starts`."""
+        return max(0, math.ceil(self.learning_starts / self.collect_steps) - 1)
+
+
+class TrainState(NamedTuple):
+    """Everything that training carries; leading axis [seeds] but for `collects`."""
+
+    groups: tuple[GroupState, ...]
+    env: EnvState
+    replay: chex.Array
+    """[seeds, capacity, row_size]"""
+    key: chex.PRNGKey
+    collects: chex.Array
+    """int32 scalar: collects done, prefill included. Steps, updates and the replay's cursor follow from it."""
+
+
+class Metrics(NamedTuple):
+    """Of one chunk: leading axes [seeds, cycles]."""
+
+    episodes: Episodes
+    """Sums over the episodes that ended in the cycle."""
+    update: UpdateMetrics
+    """Means over the updates of the cycle (actor_loss over those that moved the actor)."""
+
+
+class Trainer:
+    """Programs that start and advance the training of `num_seeds` seeds.
+
+    Args:
+        spec: agents and algorithms of `env`.
+        hyper: for each team its `HyperParams`, every leaf a number or an array [seeds].
+        devices: where the seeds are spread out; default all devices, at most one a seed.
+        piece: how many of a device's seeds are updated together; default 1 on CPU (a seed's batch stays in cache) and
+            all of them elsewhere.
+    """
+
+    def __init__(
+        self,
+        env: Environment,
+        spec: Spec,
+        schedule: Schedule,
+        hyper: dict[str, HyperParams],
+        num_seeds: int,
+        devices: Sequence[jax.Device] | None = None,
+        piece: int | None = None,
+    ):
+        self.env, self.spec, self.schedule, self.num_seeds = env, spec, schedule, num_seeds
+        devices = list(jax.devices() if devices is None else devices)[:num_seeds]
+        self.mesh = Mesh(np.array(devices), ("seeds",))
+        self.rows = math.ceil(num_seeds / len(devices)) * len(devices)
+        """Seeds actually run: `num_seeds` filled up to a multiple of the devices with copies of the last one."""
+        self.piece = piece or (1 if devices[0].platform == "cpu" else self.rows // len(devices))
+        per_group = [hyper[spec.teams[group.members[0]]] for group in spec.groups]
+        spread = [
+            jax.tree.map(lambda h: jnp.broadcast_to(jnp.asarray(h, jnp.float32), num_seeds), h) for h in per_group
+        ]
+        self.hyper = tuple(jax.tree.map(self.fill, spread))
+
+    # ---- the schedule in numbers -------------------------------------------------------------------------------------
+
+    @cached_property
+    def period(self) -> int:
+        """Updates after which every group's policy delay has come round."""
+        return math.lcm(*(group.algorithm.policy_delay for group in self.spec.groups))
+
+    @cached_property
+    def cycle_collects(self) -> int:
+        return math.lcm(self.period, self.schedule.updates_per_collect) // self.schedule.updates_per_collect
+
+    @property
+    def cycle_steps(self) -> int:
+        """Env steps of one cycle, each seed."""
+        return self.cycle_collects * self.schedule.collect_steps
+
+    @property
+    def prefill_steps(self) -> int:
+        return self.schedule.prefill_collects * self.schedule.collect_steps
+
+    def env_steps(self, collects: int) -> int:
+        """Env steps a seed after `collects` collects."""
+        return collects * self.schedule.collect_steps
+
+    def updates(self, collects: int) -> int:
+        """Updates a seed after `collects` collects."""
+        return max(0, collects - self.schedule.prefill_collects) * self.schedule.updates_per_collect
+
+    @property
+    def replay_bytes(self) -> int:
+        """Memory of the replay of all seeds."""
+        return 4 * self.rows * self.schedule.replay_capacity * self.spec.row_size
+
+    def filled_rows(self, collects: int) -> int:
+        """Transitions in each seed's replay after `collects` collects."""
+        return min(self.env_steps(collects), self.schedule.replay_capacity)
+
+    # ---- seeds over devices ------------------------------------------------------------------------------------------
+
+    def fill(self, leaf: chex.Array) -> chex.Array:
+        """A leaf [num_seeds, ...] filled up to the seeds actually run, with copies of the last."""
+        extra = self.rows - leaf.shape[0]
+        return jnp.concatenate([leaf, jnp.repeat(leaf[-1:], extra, axis=0)]) if extra else leaf
+
+    def device_seeds(self) -> list[tuple[jax.Device, list[int]]]:
+        """Each device with the numbers of the seeds it runs (copies bear the last seed's number)."""
+        share = self.rows // self.mesh.size
+        numbers = [min(seed, self.num_seeds - 1) for seed in range(self.rows)]
+        return [(d, numbers[i * share : (i + 1) * share]) for i, d in enumerate(self.mesh.devices.flat)]
+
+    @property
+    def shardings(self) -> TrainState:
+        """Sharding of each field of the state (a prefix tree)."""
+        seeds = NamedSharding(self.mesh, P("seeds"))
+        return TrainState(seeds, seeds, seeds, seeds, NamedSharding(self.mesh, P()))  # type: ignore[arg-type]
+
+    def _sharded(self, f: Callable, in_specs, out_specs) -> Callable:
+        return jax.shard_map(f, mesh=self.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
+
+    # ---- programs ----------------------------------------------------------------------------------------------------
+
+    def init(self, keys: chex.PRNGKey) -> TrainState:
+        """The state of fresh runs, one for each of `keys` [num_seeds]. The replay is allocated here."""
+        state = self._init(self.fill(keys))
+        capacity = self.schedule.replay_capacity
+        allocate = partial(replay.allocate, self.rows, capacity, self.spec.row_size)
+        return state._replace(replay=jax.jit(allocate, out_shardings=self.shardings.replay)())
+
+    def abstract_state(self) -> TrainState:
+        """Shapes and types of the state, with an empty replay."""
+        keys = jax.eval_shape(jax.vmap(jax.random.key), jax.ShapeDtypeStruct((self.rows,), jnp.int32))
+        return jax.eval_shape(self._init, keys)
+
+    @cached_property
+    def _init(self) -> Callable:
+        def one(key):
+            network_key, env_key, key = jax.random.split(key, 3)
+            return learner.init(self.spec, network_key), rollout.start(self.env, env_key, self.schedule.num_envs), key
+
+        def init(keys):
+            groups, env, keys = jax.vmap(one)(keys)
+            return TrainState(groups, env, jnp.zeros((keys.shape[0], 0, 0)), keys, jnp.int32(0))
+
+        return jax.jit(self._sharded(init, P("seeds"), self._specs))
+
+    @property
+    def _specs(self) -> TrainState:
+        return TrainState(P("seeds"), P("seeds"), P("seeds"), P("seeds"), P())  # type: ignore[arg-type]
+
+    def _collect(self, state: TrainState, hyper, random: bool = False) -> tuple[TrainState, Episodes]:
+        """One collect of all local seeds."""
+
+        def one(groups, env, key, hyper):
+            actors = [group.actor for group in groups]
+            return rollout.collect(
+                self.env, self.spec, actors, hyper, env, key, self.schedule.rollout_length, random=random
+            )
+
+        keys = jax.vmap(partial(jax.random.split, num=2))(state.key)
+        env, rows, episodes = jax.vmap(one)(state.groups, state.env, keys[:, 0], hyper)
+        rows = replay.write(state.replay, rows, state.collects)
+        state = state._replace(env=env, replay=rows, key=keys[:, 1], collects=state.collects + 1)
+        return state, episodes
+
+    @cached_property
+    def prefill(self) -> Callable[[TrainState], tuple[TrainState, Episodes]]:
+        """Play `prefill_collects` collects without learning: (state, episodes [seeds, collects])."""
+
+        def prefill(state, hyper):
+            random = self.schedule.warmup == "random"
+            state, episodes = jax.lax.scan(
+                lambda s, _: self._collect(s, hyper, random), state, length=self.schedule.prefill_collects
+            )
+            return state, _seeds_first(episodes)
+
+        program = self._program(prefill, (self._specs, P("seeds")))
+        return lambda state: program(state, self.hyper)
+
+    def _update(self, state: TrainState, hyper, first: int) -> tuple[TrainState, UpdateMetrics]:
+        """The updates after one collect, piece after piece of the local seeds; `first`: number of the first of them."""
+        schedule, groups = self.schedule, self.spec.groups
+        size = replay.filled(schedule.replay_capacity, schedule.collect_steps, state.collects)
+        batches = 1 if schedule.shared_minibatch else self.spec.num_agents
+        unrolled = math.gcd(self.period, schedule.updates_per_collect)
+
+        def stretch(seed, hyper, carry, keys):
+            states, metrics = carry, []
+            for u in range(unrolled):
+                index_key, update_key = jax.random.split(keys[u])
+                indices = replay.sample_indices(index_key, size, (batches, schedule.batch_size))
+                rows = replay.gather(state.replay, seed, indices)
+                move = [(first + u + 1) % group.algorithm.policy_delay == 0 for group in groups]
+                states, m = learner.update(self.spec, states, hyper, rows, update_key, move, schedule.sequential)
+                metrics.append(m)
+            return states, jax.tree.map(lambda *m: jnp.stack(m), *metrics)
+
+        def one(args):
+            seed, states, key, hyper = args
+            keys = jax.random.split(key, schedule.updates_per_collect).reshape(-1, unrolled)
+            if keys.shape[0] == 1:
+                states, metrics = stretch(seed, hyper, states, keys[0])
+            else:
+                states, metrics = jax.lax.scan(partial(stretch, seed, hyper), states, keys)
+            return states, jax.tree.map(lambda m: m.reshape(-1, m.shape[-1]), metrics)
+
+        keys = jax.vmap(partial(jax.random.split, num=2))(state.key)
+        seeds = jnp.arange(keys.shape[0])
+        states, metrics = jax.lax.map(one, (seeds, state.groups, keys[:, 0], hyper), batch_size=self.piece)
+        return state._replace(groups=states, key=keys[:, 1]), metrics
+
+    def _cycle(self, state: TrainState, hyper) -> tuple[TrainState, Metrics]:
+        episodes, metrics = [], []
+        for c in range(self.cycle_collects):
+            state, e = self._collect(state, hyper)
+            state, m = self._update(state, hyper, first=c * self.schedule.updates_per_collect)
+            episodes.append(e)
+            metrics.append(m)
+        total = jax.tree.map(lambda *e: sum(e), *episodes)
+        mean = jax.tree.map(lambda *m: jnp.nanmean(jnp.concatenate(m, axis=1), axis=1), *metrics)
+        return state, Metrics(total, mean)
+
+    def chunk(self, cycles: int) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
+        """The program of `cycles` cycles: (state, metrics [seeds, cycles]). The state given in is donated."""
+        program = self._chunk(cycles)
+        return lambda state: program(state, self.hyper)
+
+    def _chunk(self, cycles: int) -> Callable:
+        def chunk(state, hyper):
+            state, metrics = jax.lax.scan(lambda s, _: self._cycle(s, hyper), state, length=cycles)
+            return state, _seeds_first(metrics)
+
+        return self._program(chunk, (self._specs, P("seeds")))
+
+    def _program(self, f: Callable, in_specs) -> Callable:
+        return jax.jit(self._sharded(f, in_specs, (self._specs, P("seeds"))), donate_argnums=0)
+
+    def evaluate(self, state: TrainState, keys: chex.PRNGKey, episodes: int, deterministic: bool):
+        """`rollout.evaluate` of every seed: returns [num_seeds, episodes, num_agents], lengths [num_seeds, episodes]."""
+
+        def one(groups, hyper, key):
+            actors = [group.actor for group in groups]
+            return rollout.evaluate(self.env, self.spec, actors, hyper, key, episodes, deterministic)
+
+        program = jax.jit(self._sharded(jax.vmap(one), P("seeds"), P("seeds")))
+        returns, lengths = program(state.groups, self.hyper, self.fill(keys))
+        return returns[: self.num_seeds], lengths[: self.num_seeds]
+
+
+def _seeds_first(tree):
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), tree)

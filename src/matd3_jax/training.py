@@ -1,0 +1,227 @@
+"""A run from its settings: what `matd3_jax.train` returns, and what the command advances chunk by chunk."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from matd3_jax import config as configuration
+from matd3_jax import devices, envs
+from matd3_jax.config import Config
+from matd3_jax.envs.base import Environment
+from matd3_jax.envs.joint import JointTeam
+from matd3_jax.errors import UserError
+from matd3_jax.rollout import Episodes
+from matd3_jax.spec import Spec
+from matd3_jax.trainer import Metrics, Schedule, Trainer, TrainState
+
+Row = dict[str, np.ndarray]
+"""Columns of the metrics table for one chunk: each [seeds]; "step" and "seed" among them."""
+
+
+@dataclasses.dataclass
+class Result:
+    """What `train` returns."""
+
+    config: Config
+    training: "Training"
+    state: TrainState
+    """Everything trained, leading axis [seeds] (see `trainer.TrainState`)."""
+    metrics: dict[str, np.ndarray]
+    """Columns of the metrics table, each [seeds, chunks]; "step" is env steps of each seed."""
+
+    def evaluate(self, episodes: int = 100, deterministic: bool = True, seed: int = 0) -> np.ndarray:
+        """Undiscounted returns [seeds, episodes, agents] of whole episodes (see `Trainer.evaluate`)."""
+        return self.training.evaluate(self.state, episodes, deterministic, seed)
+
+
+class Training:
+    """Programs and plan of one run.
+
+    Args:
+        config: checked settings.
+        env: the environment; default: the one that `config.env` names.
+
+    Raises UserError where the environment does not take its options, or a team has no agents.
+    """
+
+    def __init__(self, config: Config, env: Environment | None = None):
+        self.config = config
+        base = envs.make(**config.env) if env is None else env
+        teams = config.teams()
+        if config.adversary is not None and "adversaries" not in base.teams:
+            raise UserError(f"adversary={config.adversary.name}: {config.env['name']} has no adversaries")
+        joint = tuple(team for team in dict.fromkeys(base.teams) if teams[team].joint)
+        for team in joint:
+            base = JointTeam(base, (team,))
+        self.env = base
+        self.spec = Spec.of(self.env, {team: algo.algorithm() for team, algo in teams.items()})
+        schedule = Schedule(
+            num_envs=config.num_envs,
+            rollout_length=config.rollout_length,
+            updates_per_collect=config.updates_per_collect,
+            batch_size=config.batch_size,
+            replay_capacity=config.replay_capacity,
+            learning_starts=config.learning_starts,
+            warmup=config.warmup,
+            shared_minibatch=config.shared_minibatch,
+            sequential=config.update_order == "sequential",
+        )
+        hyper = {team: algo.hyper_params() for team, algo in teams.items()}
+        trainer = Trainer(self.env, self.spec, schedule, hyper, config.seeds)
+        # Whole chunks of equal length, so that one compiled program does for all; as many as come closest to log_every.
+        cycles = max(1, math.ceil((config.total_steps - trainer.prefill_steps) / trainer.cycle_steps))
+        wanted = max(1, round((config.log_every or config.total_steps / 100) / trainer.cycle_steps))
+        self.num_chunks = math.ceil(cycles / wanted)
+        self.cycles_per_chunk = math.ceil(cycles / self.num_chunks)
+        self.total_steps = trainer.prefill_steps + self.num_chunks * self.cycles_per_chunk * trainer.cycle_steps
+        """Env steps of each seed: the first whole chunk at or after the wanted number."""
+        # Rows that would never be written are not allocated: the same result in less memory.
+        capacity = min(config.replay_capacity, self.total_steps)
+        schedule = dataclasses.replace(schedule, replay_capacity=capacity)
+        self.trainer = Trainer(self.env, self.spec, schedule, hyper, config.seeds)
+        self._program: Callable | None = None
+
+    # ---- memory ------------------------------------------------------------------------------------------------------
+
+    @property
+    def memory(self) -> str:
+        """The arithmetic of the replay's memory."""
+        t, s = self.trainer, self.spec
+        return (
+            f"replay: {t.rows} seeds x {t.schedule.replay_capacity:,} transitions x {s.row_size} numbers x 4 bytes "
+            f"= {t.replay_bytes / 1e9:.2f} GB (x {s.observation_size}, actions {s.action_size}, "
+            f"rewards {s.num_agents}, x' {s.observation_size}, discount 1)"
+        )
+
+    def check_memory(self) -> None:
+        """Raise UserError, with the arithmetic, if the replay cannot fit."""
+        free = devices.free_memory()
+        if self.trainer.replay_bytes > free:
+            raise UserError(
+                f"{self.memory}, but only {free / 1e9:.2f} GB are free: fewer seeds, or replay_capacity at most "
+                f"{int(free / (4 * self.trainer.rows * self.spec.row_size)):,}"
+            )
+
+    # ---- running -----------------------------------------------------------------------------------------------------
+
+    def keys(self) -> jax.Array:
+        """One key a seed; a seed's key does not depend on the seeds beside it."""
+        return jax.vmap(jax.random.key)(np.arange(self.config.seed, self.config.seed + self.config.seeds))
+
+    def start(self) -> tuple[TrainState, Row]:
+        """The state after the prefill, and what the untrained policies got there."""
+        self.check_memory()
+        state, episodes = self.trainer.prefill(self.trainer.init(self.keys()))
+        return state, self.row(state, Metrics(episodes, None))  # type: ignore[arg-type]
+
+    def advance(self, state: TrainState) -> tuple[TrainState, Row]:
+        """One chunk. The state given in is donated."""
+        if self._program is None:
+            self._program = self.trainer.chunk(self.cycles_per_chunk)
+        state, metrics = self._program(state)
+        return state, self.row(state, metrics)
+
+    def step(self, state: TrainState) -> int:
+        """Env steps of each seed so far."""
+        return self.trainer.env_steps(int(state.collects))
+
+    def row(self, state: TrainState, metrics: Metrics) -> Row:
+        """The chunk's row of the metrics table for each seed."""
+        seeds = self.config.seeds
+        collects = int(state.collects)
+        row: Row = {
+            "step": np.full(seeds, self.trainer.env_steps(collects)),
+            "seed": np.arange(self.config.seed, self.config.seed + seeds),
+            "updates": np.full(seeds, self.trainer.updates(collects)),
+        }
+        episodes = Episodes(*(np.asarray(e, np.float64)[:seeds].sum(axis=1) for e in metrics.episodes))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            returns = episodes.episode_return / episodes.count[:, None]
+            length = episodes.length / episodes.count
+        row["episodes"] = episodes.count.astype(int)
+        row["episode_length"] = length
+        for team in dict.fromkeys(self.spec.teams):
+            row[f"return_{team}"] = returns @ self.team_weights(team)
+        for i, agent in enumerate(self.spec.agents):
+            row[f"{agent}_return"] = returns[:, i]
+        losses = metrics.update._asdict() if metrics.update is not None else {}
+        for name in ("critic_loss", "q_value", "actor_loss"):
+            values = np.asarray(losses[name], np.float64)[:seeds].mean(axis=1) if losses else None
+            for i, agent in enumerate(self.spec.agents):
+                row[f"{agent}_{name}"] = np.full(seeds, np.nan) if values is None else values[:, i]
+        return row
+
+    def team_weights(self, team: str) -> np.ndarray:
+        """Weights [agents] of the agents' returns in the number reported for a team (`Environment.return_weights`)."""
+        member = np.array([t == team for t in self.spec.teams])
+        return np.where(member, self.env.return_weights, 0.0)
+
+    def evaluate(self, state: TrainState, episodes: int, deterministic: bool, seed: int = 0) -> np.ndarray:
+        """Undiscounted returns [seeds, episodes, agents] of whole episodes; every seed starts from the same keys."""
+        keys = jax.vmap(lambda _: jax.random.key(seed))(np.arange(self.config.seeds))
+        return np.asarray(self.trainer.evaluate(state, keys, episodes, deterministic)[0])
+
+
+def train(
+    *overrides: str,
+    env: str | Environment = "simple_spread",
+    algo: str = "matd3",
+    callback: Callable[[Row], None] | None = None,
+    **settings: Any,
+) -> Result:
+    """Train `seeds` runs side by side and return their states and metrics.
+
+    Takes what the command line takes: `train(env="simple_tag", algo="matd3", adversary="maddpg", seeds=8)`, and
+    single values as strings: `train("algo.lr=0.003", "env.num_good=2", ...)`. Writes no files.
+
+    Args:
+        env: a name, or an `Environment` of your own.
+        callback: called with every chunk's row (columns [seeds]) as it comes.
+
+    Raises UserError for settings that are unknown or impossible.
+    """
+    devices.prepare()
+    own = None if isinstance(env, str) else env
+    chosen = [f"algo={algo}", *(f"{key}={_text(value)}" for key, value in settings.items()), *overrides]
+    config = configuration.load(chosen if own is not None else [f"env={env}", *chosen])
+    if own is not None:
+        config = dataclasses.replace(config, env={"name": type(own).__name__})
+    training = Training(config, own)
+    state, rows = None, []
+    for state, row in training_chunks(training):
+        rows.append(row)
+        if callback is not None:
+            callback(row)
+    assert state is not None
+    return Result(config, training, state, stack(rows))
+
+
+def training_chunks(training: Training) -> Iterator[tuple[TrainState, Row]]:
+    """The states and rows of a fresh run: after the prefill, then after every chunk."""
+    state, row = training.start()
+    yield state, row
+    for _ in range(training.num_chunks):
+        state, row = training.advance(state)
+        yield state, row
+
+
+def stack(rows: list[Row]) -> dict[str, np.ndarray]:
+    """Columns [seeds, chunks] of rows with columns [seeds]."""
+    return {name: np.stack([row[name] for row in rows], axis=1) for name in rows[0]}
+
+
+def _text(value: Any) -> str:
+    """A value in Hydra's grammar."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{k}:{_text(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ",".join(map(_text, value)) + "]"
+    return str(value)
