@@ -1,0 +1,130 @@
+"""`python -m benchmarks.throughput`: env steps/s and updates/s of rollout alone, update alone and the whole loop.
+
+    python -m benchmarks.throughput [env=simple_spread] [seeds=[1,4,20]] [repeats=5] [out=FILE.json] [key=value ...]
+
+Other keys are settings of the run, as `python -m matd3_jax.train` takes them. Every figure counts all seeds together
+and is the median of `repeats` stretches of about a second, with the slowest and the fastest beside it. "update alone"
+gives the env steps/s at which a loop with free rollouts would run.
+"""
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from matd3_jax import command, config, devices
+from matd3_jax.errors import UserError
+from matd3_jax.trainer import Trainer, TrainState
+from matd3_jax.training import Training
+
+DEFAULTS: dict[str, Any] = {"seeds": [1, 4, 20], "repeats": 5, "seconds": 1.0, "out": None}
+
+
+def main(argv: Sequence[str]) -> int:
+    devices.prepare()
+    taken, overrides = config.take(argv, tuple(DEFAULTS))
+    options = {**DEFAULTS, **taken}
+    counts = options["seeds"] if isinstance(options["seeds"], list) else [options["seeds"]]
+    if not all(type(n) is int and n >= 1 for n in counts):
+        raise UserError(f"seeds={options['seeds']!r}: must be whole numbers of at least 1, for instance seeds=[1,4,20]")
+    report = {"machine": devices.description(), "versions": devices.versions(), "commit": commit(), "settings": argv}
+    for key in ("machine", "versions", "commit"):
+        print(f"{key}: {report[key]}")
+    print(f"{'seeds':>5} {'part':<10} {'env steps/s':>12} {'slowest':>10} {'fastest':>10} {'updates/s':>10}", flush=True)
+    rows = []
+    for seeds in counts:
+        for row in measure(overrides, seeds, options["repeats"], options["seconds"]):
+            rows.append(row)
+            print(f"{row['seeds']:>5} {row['part']:<10} {row['env_steps_per_second']:>12,.0f} {row['slowest']:>10,.0f} "
+                  f"{row['fastest']:>10,.0f} {row['updates_per_second']:>10,.1f}"
+                  f"   compiled in {row['compile_seconds']:.1f} s", flush=True)  # fmt: skip
+    report["rows"] = rows
+    if options["out"] is not None:
+        Path(options["out"]).write_text(json.dumps(report, indent=1) + "\n")
+    return 0
+
+
+def measure(overrides: Sequence[str], seeds: int, repeats: int, seconds: float) -> list[dict[str, Any]]:
+    """Rows of the table for one number of seeds."""
+    # Replay no larger than a short run needs: its size does not change the work, only the memory.
+    settings = config.load([f"seeds={seeds}", "total_steps=100000", *overrides])
+    training = Training(settings)
+    training.check_memory()
+    trainer = training.trainer
+    state, _ = training.start()
+    rows = []
+    parts: dict[str, Callable[[TrainState, Any], Any]] = {
+        "rollout": lambda s, h: _collects(trainer, s, h),
+        "update": lambda s, h: _updates(trainer, s, h),
+        "loop": trainer.cycle,
+    }
+    for part, cycle in parts.items():
+        # Cycles in one call: first a guess, then as many as take the wanted time.
+        cycles, compile_seconds = 2, None
+        for attempt in range(2):
+            program = trainer.program(cycle, cycles)
+            begun = time.perf_counter()
+            state = jax.block_until_ready(program(state)[0])
+            if attempt == 0:
+                compile_seconds = time.perf_counter() - begun
+            begun = time.perf_counter()
+            state = jax.block_until_ready(program(state)[0])
+            cycles = max(2, round(cycles * seconds / (time.perf_counter() - begun)))
+        times = []
+        for _ in range(repeats):
+            begun = time.perf_counter()
+            state = jax.block_until_ready(program(state)[0])
+            times.append(time.perf_counter() - begun)
+        cycles = program.cycles
+        steps = seeds * cycles * trainer.cycle_steps
+        updates = seeds * cycles * trainer.cycle_collects * trainer.schedule.updates_per_collect
+        rows.append(
+            {
+                "seeds": seeds,
+                "part": part,
+                "env_steps_per_second": steps / float(np.median(times)),
+                "slowest": steps / max(times),
+                "fastest": steps / min(times),
+                "updates_per_second": 0.0 if part == "rollout" else updates / float(np.median(times)),
+                "compile_seconds": compile_seconds,
+            }
+        )
+    return rows
+
+
+def _collects(trainer: Trainer, state: TrainState, hyper: Any) -> tuple[TrainState, Any]:
+    episodes = None
+    for _ in range(trainer.cycle_collects):
+        state, episodes = trainer.collect(state, hyper)
+    return state, episodes
+
+
+def _updates(trainer: Trainer, state: TrainState, hyper: Any) -> tuple[TrainState, Any]:
+    metrics = None
+    for c in range(trainer.cycle_collects):
+        state, metrics = trainer.learn(state, hyper, first=c * trainer.schedule.updates_per_collect)
+    return state, metrics
+
+
+def commit() -> str:
+    """The git commit of the project, marked where files differ from it."""
+    here = Path(__file__).parent
+
+    def git(*words: str) -> str:
+        return subprocess.run(["git", *words], cwd=here, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        return git("rev-parse", "--short", "HEAD") + (" with changes" if git("status", "--porcelain", "-uno") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+if __name__ == "__main__":
+    sys.argv[0] = "throughput"
+    command.run(main)
