@@ -36,7 +36,9 @@ def main(argv: Sequence[str]) -> int:
     report = {"machine": devices.description(), "versions": devices.versions(), "commit": commit(), "settings": argv}
     for key in ("machine", "versions", "commit"):
         print(f"{key}: {report[key]}")
-    print(f"{'seeds':>5} {'part':<10} {'env steps/s':>12} {'slowest':>10} {'fastest':>10} {'updates/s':>10}", flush=True)
+    print(
+        f"{'seeds':>5} {'part':<10} {'env steps/s':>12} {'slowest':>10} {'fastest':>10} {'updates/s':>10}", flush=True
+    )
     rows = []
     for seeds in counts:
         for row in measure(overrides, seeds, options["repeats"], options["seconds"]):

@@ -1,8 +1,6 @@
 """Settings of a run: read from files and overrides in Hydra's grammar, typed, and checked before anything starts."""
 
 import dataclasses
-import math
-import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,17 +15,11 @@ from omegaconf.errors import OmegaConfBaseException
 from matd3_jax.algorithms import Algorithm, HyperParams
 from matd3_jax.envs.base import nearest
 from matd3_jax.errors import UserError
+from matd3_jax.typed import plain, typed
+from matd3_jax.validation import check
 
 GROUPS = ("env", "algo", "adversary")
 """Keys that choose a file; `adversary` takes the files of `algo`."""
-
-CHOICES = {
-    "critic": ("central", "own"),
-    "clip": ("variable", "network", "none"),
-    "adam": ("standard", "epsilon_hat"),
-    "update_order": ("simultaneous", "sequential"),
-    "warmup": ("policy", "random"),
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +89,7 @@ class Config:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as `from_dict` takes them."""
-        return _plain(dataclasses.asdict(self))
+        return plain(dataclasses.asdict(self))
 
 
 # ---- reading ---------------------------------------------------------------------------------------------------------
@@ -133,13 +125,13 @@ def load(overrides: Sequence[str] = ()) -> Config:
             tree = compose("config", lines)
             _check_keys(tree, values)
             tree = compose("config", lines + [_line(o) for o in values])
-            plain = OmegaConf.to_container(tree, resolve=True, throw_on_missing=True)
+            resolved = OmegaConf.to_container(tree, resolve=True, throw_on_missing=True)
         except (HydraException, OmegaConfBaseException) as error:
             raise UserError(_one_line(error)) from error
-    assert isinstance(plain, dict)
+    assert isinstance(resolved, dict)
     for key in ("resume", "checkpoint"):  # the command's own, see train.py
-        plain.pop(key)
-    return from_dict(plain)
+        resolved.pop(key)
+    return from_dict(resolved)  # type: ignore[arg-type]
 
 
 def parse(overrides: Sequence[str]) -> list[Override]:
@@ -176,9 +168,9 @@ def known_names(group: str) -> tuple[str, ...]:
 def read(path: Path) -> Config:
     """The configuration that `write` left. Raises UserError if it cannot be read."""
     try:
-        plain = OmegaConf.to_container(OmegaConf.load(path))
-        assert isinstance(plain, dict)
-        return from_dict(plain)
+        found = OmegaConf.to_container(OmegaConf.load(path))
+        assert isinstance(found, dict)
+        return from_dict(found)  # type: ignore[arg-type]
     except (OSError, AssertionError, ValueError, OmegaConfBaseException) as error:
         raise UserError(f"cannot read the configuration {path}: {_one_line(error)}") from error
 
@@ -193,15 +185,15 @@ def write(config: Config, path: Path) -> None:
     path.write_text(text(config))
 
 
-def from_dict(plain: Mapping[str, Any]) -> Config:
+def from_dict(values: Mapping[str, Any]) -> Config:
     """A checked configuration from plain values. Raises UserError."""
-    plain = dict(plain)
-    env = plain.pop("env")
-    algo = _typed(AlgoConfig, {k: v for k, v in plain.pop("algo").items() if k != "lr"}, "algo.")
-    adversary = plain.pop("adversary", None)
+    rest = dict(values)
+    env = rest.pop("env")
+    algo = typed(AlgoConfig, {k: v for k, v in rest.pop("algo").items() if k != "lr"}, "algo.")
+    adversary = rest.pop("adversary", None)
     if adversary is not None:
-        adversary = _typed(AlgoConfig, {k: v for k, v in adversary.items() if k != "lr"}, "adversary.")
-    config = _typed(Config, {**plain, "env": env, "algo": algo, "adversary": adversary}, "")
+        adversary = typed(AlgoConfig, {k: v for k, v in adversary.items() if k != "lr"}, "adversary.")
+    config = typed(Config, {**rest, "env": env, "algo": algo, "adversary": adversary}, "")
     check(config)
     return config
 
@@ -236,116 +228,3 @@ def _renamed(override: Override) -> Override:
 
 def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split())
-
-
-# ---- types -----------------------------------------------------------------------------------------------------------
-
-
-def _typed(cls: Any, values: Mapping[str, Any], prefix: str) -> Any:
-    """A dataclass of plain values, each of its field's type."""
-    fields = typing.get_type_hints(cls)
-    for name in values:
-        if name not in fields:
-            raise UserError(f"there is no key {prefix + name!r}; {nearest(name, fields)}")
-    for name in fields:
-        if name not in values:
-            raise UserError(f"the key {prefix + name!r} is missing")
-    return cls(**{name: _convert(prefix + name, values[name], hint) for name, hint in fields.items()})
-
-
-def _convert(key: str, value: Any, hint: Any) -> Any:
-    options = typing.get_args(hint) if not hasattr(hint, "__origin__") else ()
-    if type(None) in options:
-        if value is None:
-            return None
-        hint = next(option for option in options if option is not type(None))
-    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
-    if hint is int and isinstance(value, float) and value.is_integer():
-        return int(value)  # 1e6 reads better than 1000000
-    if hint == tuple[int, ...]:
-        if isinstance(value, list | tuple) and all(type(v) is int for v in value):
-            return tuple(value)
-        raise UserError(f"{key}={value!r}: must be a list of whole numbers, for instance [64,64]")
-    plain = hint if isinstance(hint, type) else Mapping
-    if not isinstance(value, plain) or (isinstance(value, bool) and hint is not bool):
-        kind = {int: "a whole number", float: "a number", bool: "true or false", str: "a word"}.get(
-            hint, "a group of keys"
-        )
-        raise UserError(f"{key}={value!r}: must be {kind}")
-    return value
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {k: _plain(v) for k, v in value.items()}
-    return list(value) if isinstance(value, tuple) else value
-
-
-# ---- checks ----------------------------------------------------------------------------------------------------------
-
-
-def check(config: Config) -> None:
-    """Raise UserError for the first value, or combination of values, that is impossible."""
-
-    def need(ok: bool, message: str) -> None:
-        if not ok:
-            raise UserError(message)
-
-    for key in ("total_steps", "seeds", "num_envs", "rollout_length", "updates_per_collect", "batch_size",
-                "replay_capacity", "learning_starts", "keep_checkpoints"):  # fmt: skip
-        need(getattr(config, key) >= 1, f"{key}={getattr(config, key)}: must be at least 1")
-    need(0 <= config.seed < 2**31, f"seed={config.seed}: must be between 0 and {2**31 - 1}")
-    for key in ("log_every", "checkpoint_every"):
-        value = getattr(config, key)
-        need(value is None or value >= (key == "log_every"), f"{key}={value}: must be positive")
-    for name, team in {"algo": config.algo, "adversary": config.adversary}.items():
-        if team is not None:
-            _check_team(name, team, config.updates_per_collect, need)
-    _check_choices("", config, need)
-    collect = config.num_envs * config.rollout_length
-    need(
-        config.batch_size <= config.replay_capacity,
-        f"batch_size={config.batch_size} is larger than replay_capacity={config.replay_capacity}",
-    )
-    need(
-        config.learning_starts <= config.replay_capacity,
-        f"learning_starts={config.learning_starts} is larger than replay_capacity={config.replay_capacity}: "
-        "learning would never start",
-    )
-    need(
-        config.replay_capacity % collect == 0,
-        f"replay_capacity={config.replay_capacity} is not a multiple of the {collect} transitions of one collect "
-        f"(num_envs={config.num_envs} x rollout_length={config.rollout_length}); "
-        f"nearest: {max(1, round(config.replay_capacity / collect)) * collect}",
-    )
-    need(
-        config.total_steps >= config.learning_starts,
-        f"total_steps={config.total_steps} ends before learning starts (learning_starts={config.learning_starts})",
-    )
-
-
-def _check_team(name: str, team: AlgoConfig, updates: int, need: Any) -> None:
-    for key in ("num_critics", "policy_delay"):
-        need(getattr(team, key) >= 1, f"{name}.{key}={getattr(team, key)}: must be at least 1")
-    need(
-        updates % team.policy_delay == 0 or team.policy_delay % updates == 0,
-        f"updates_per_collect={updates} is not a multiple of {name}.policy_delay={team.policy_delay} (nor divides it)",
-    )
-    for key in ("actor_lr", "critic_lr", "max_grad_norm"):
-        value = getattr(team, key)
-        need(0 < value < math.inf, f"{name}.{key}={value}: must be positive")
-    for key in ("target_noise", "target_noise_clip", "logit_regulariser", "exploration_noise"):
-        value = getattr(team, key)
-        need(0 <= value < math.inf, f"{name}.{key}={value}: must not be negative")
-    for key in ("gamma", "tau"):
-        value = getattr(team, key)
-        need(0 <= value <= 1, f"{name}.{key}={value}: must lie between 0 and 1")
-    need(all(width >= 1 for width in team.hidden), f"{name}.hidden={list(team.hidden)}: widths must be at least 1")
-    _check_choices(name + ".", team, need)
-
-
-def _check_choices(prefix: str, part: Any, need: Any) -> None:
-    for key, allowed in CHOICES.items():
-        value = getattr(part, key, allowed[0])
-        need(value in allowed, f"{prefix}{key}={value!r}: must be one of {', '.join(allowed)}")

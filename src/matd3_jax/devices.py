@@ -17,7 +17,7 @@ def prepare() -> None:
     Leaves alone what the user has set: `JAX_NUM_CPU_DEVICES`, `JAX_COMPILATION_CACHE_DIR`. Too late, and without
     effect, once JAX has computed something: a library user's own devices stand.
     """
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ and jax.config.jax_compilation_cache_dir is None:
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ and getattr(jax.config, "jax_compilation_cache_dir", None) is None:
         home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
         jax.config.update("jax_compilation_cache_dir", str(home / "matd3_jax"))
     if "JAX_NUM_CPU_DEVICES" in os.environ or "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):

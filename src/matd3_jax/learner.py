@@ -13,11 +13,12 @@ import optax
 
 from matd3_jax import networks, optimiser
 from matd3_jax.algorithms import HyperParams
-from matd3_jax.spec import Block, Group, RowParts, Spec
+from matd3_jax.envs.base import ActionSpace
+from matd3_jax.spec import Group, Spec
 
 
 class GroupState(NamedTuple):
-    """Networks and optimisers of one group; parameters have leading axes [members] (actor), [members, critics] (critic)."""
+    """Networks and optimisers of one group. Leaves have leading axes [members], critics [members, critics]."""
 
     actor: chex.ArrayTree
     critic: chex.ArrayTree
@@ -38,12 +39,41 @@ class UpdateMetrics(NamedTuple):
     """NaN where this update left the actor alone."""
 
 
+class Minibatch(NamedTuple):
+    """What one agent learns from in one update; a leading axis [members] for several."""
+
+    observation: chex.Array
+    """[batch, observation size] o_i."""
+    action: chex.Array
+    """[batch, action size] a_i as replayed."""
+    inputs: chex.Array
+    """[batch, critic inputs] what the critics read: x and a, or o_i and a_i."""
+    reward: chex.Array
+    """[batch] r_i."""
+    discount: chex.Array
+    """[batch] 0 where the episode terminated, else 1."""
+    next_observations: tuple[chex.Array, ...]
+    """o' of those whose target actors the target needs, one array [agents, batch, observation size] per group."""
+    next_x: chex.Array
+    """[batch, critic inputs without actions] x', or o'_i."""
+    action_column: chex.Array
+    """int32 scalar: where a_i stands in `inputs`."""
+
+
+class Noise(NamedTuple):
+    """All random numbers of one agent's update; a leading axis [members] for several."""
+
+    target: tuple[chex.Array | None, ...]
+    """Of the target actors' own sampling, [agents, batch, action size] per group of `next_observations`."""
+    smoothing: tuple[chex.Array | None, ...]
+    """Standard normal, of the same shapes; None without smoothing."""
+    action: chex.Array | None
+    """[batch, action size] of the own new action."""
+
+
 def actor_of(group: Group) -> networks.StackedMLP:
-    return networks.actor_network(len(group.members), group.algorithm.hidden, group.action_space)
-
-
-def critic_of(group: Group) -> networks.StackedMLP:
-    return networks.critic_network(len(group.members), group.algorithm.num_critics, group.algorithm.hidden)
+    """The actors of a whole group, [members] stacked."""
+    return networks.actor_network((len(group.members),), group.algorithm.hidden, group.action_space)
 
 
 def critic_input_size(spec: Spec, group: Group) -> int:
@@ -56,23 +86,26 @@ def init(spec: Spec, key: chex.PRNGKey) -> tuple[GroupState, ...]:
     """Fresh networks and optimisers of all groups."""
 
     def one(group: Group, key: chex.PRNGKey) -> GroupState:
-        keys = jax.random.split(key, 4)
-        members = len(group.members)
-        observation = jnp.zeros((members, 1, group.observation_size))
-        inputs = jnp.zeros((members, 1, critic_input_size(spec, group)))
-        actor, critic = actor_of(group), critic_of(group)
+        algorithm, keys = group.algorithm, jax.random.split(key, 4)
+        actor = networks.actor_network((), algorithm.hidden, group.action_space)
+        critic = networks.critic_network(algorithm.num_critics, algorithm.hidden)
+        observation = jnp.zeros((1, group.observation_size))
+        inputs = jnp.zeros((1, critic_input_size(spec, group)))
         mu, q = actor.init(keys[0], observation)["params"], critic.init(keys[1], inputs)["params"]
-        if group.algorithm.sync_targets:
+        if algorithm.sync_targets:
             # Copies, not the same arrays: the state is donated, and one buffer can't be given away twice.
             mu_target, q_target = jax.tree.map(jnp.copy, (mu, q))
         else:
             mu_target = actor.init(keys[2], observation)["params"]
             q_target = critic.init(keys[3], inputs)["params"]
-        adam = optimiser.adam(group.algorithm.adam)
+        adam = optimiser.adam(algorithm.adam)
         return GroupState(mu, q, mu_target, q_target, adam.init(mu), adam.init(q))
 
-    keys = jax.random.split(key, len(spec.groups))
-    return tuple(one(group, k) for group, k in zip(spec.groups, keys, strict=True))
+    keys = jax.random.split(key, spec.num_agents)
+    return tuple(
+        jax.vmap(lambda k, group=group: one(group, k))(keys[jnp.array(group.members)])  # type: ignore[misc]
+        for group in spec.groups
+    )
 
 
 def apply(network: networks.StackedMLP, params: chex.ArrayTree, *args) -> chex.Array:
@@ -87,100 +120,111 @@ def update(
     key: chex.PRNGKey,
     move: Sequence[bool],
     sequential: bool = False,
+    one_by_one: bool = False,
 ) -> tuple[tuple[GroupState, ...], UpdateMetrics]:
     """One update of every agent's critics, and of actors and targets where `move` says so.
 
     Args:
         state, hyper: one element per group.
-        rows: replay rows [num_agents, batch, row_size], a minibatch for each agent, or [1, batch, row_size], one for all.
+        rows: replay rows [num_agents, batch, row_size], a minibatch for each agent, or [1, batch, row_size] for all.
         move: for each group whether this update moves actors and targets too (every policy_delay-th does).
-        sequential: update the agents one after another, later ones with the earlier ones' moved targets (the authors'
-            program) instead of all from the same state.
+        sequential: later agents see the earlier ones' moved target actors (the authors' program) instead of all
+            learning from the same state.
+        one_by_one: compute the agents of a group one after another instead of in one batch: the same numbers, while
+            one agent's activations stay in a CPU's cache.
     """
     mu_targets = [group.actor_target for group in state]
-    new = list(state)
-    metrics = jnp.full((3, spec.num_agents), jnp.nan)
-    shared = rows.shape[0] == 1
-    for number, block in enumerate(spec.blocks(sequential)):
-        members = spec.members(block)
-        batch = spec.row_parts(rows if shared else rows[jnp.array(members)])
-        before = _slice(state[block.group], block)
-        after, block_metrics = _update_block(
-            spec,
-            block,
-            before,
-            mu_targets,
-            hyper[block.group],
-            batch,
-            jax.random.fold_in(key, number),
-            move[block.group],
-        )
-        new[block.group] = _put(new[block.group], block, after)
-        if sequential:
-            mu_targets[block.group] = new[block.group].actor_target
-        metrics = metrics.at[:, jnp.array(members)].set(jnp.stack(block_metrics))
+    keys = jax.random.split(key, len(spec.groups))
+    batches = [_minibatches(spec, group, rows) for group in spec.groups]
+    noises = [_noise(spec, group, rows.shape[:2], k) for group, k in zip(spec.groups, keys, strict=True)]
+    new, metrics = list(state), jnp.full((3, spec.num_agents), jnp.nan)
+
+    def member(g: int, targets: Sequence[chex.ArrayTree]):
+        def f(args):
+            return _update_agent(spec, spec.groups[g], hyper[g], move[g], targets, *args)
+
+        return f
+
+    if sequential:
+        for i in range(spec.num_agents):
+            g, k = spec.place(i)
+            args = jax.tree.map(lambda leaf, k=k: leaf[k], (state[g], mu_targets[g], batches[g], noises[g]))
+            after, m = member(g, mu_targets)(args)
+            new[g] = jax.tree.map(lambda old, one, k=k: old.at[k].set(one), new[g], after)
+            mu_targets[g] = new[g].actor_target
+            metrics = metrics.at[:, i].set(jnp.stack(m))
+    else:
+        for g, group in enumerate(spec.groups):
+            args = (state[g], mu_targets[g], batches[g], noises[g])
+            new[g], m = jax.lax.map(member(g, mu_targets), args, batch_size=None if one_by_one else len(group.members))
+            metrics = metrics.at[:, jnp.array(group.members)].set(jnp.stack(m))
     return tuple(new), UpdateMetrics(*metrics)
 
 
-def _update_block(
+def _update_agent(
     spec: Spec,
-    block: Block,
-    state: GroupState,
-    mu_targets: Sequence[chex.ArrayTree],
+    group: Group,
     hyper: HyperParams,
-    batch: RowParts,
-    key: chex.PRNGKey,
     move: bool,
-) -> tuple[GroupState, UpdateMetrics]:
-    group = spec.groups[block.group]
-    members = spec.members(block)
-    algorithm, m = group.algorithm, len(spec.members(block))
-    actor = networks.actor_network(m, algorithm.hidden, group.action_space)
-    critic = networks.critic_network(m, algorithm.num_critics, algorithm.hidden)
-    target_key, action_key = jax.random.split(key)
+    mu_targets: Sequence[chex.ArrayTree],
+    state: GroupState,
+    own_target: chex.ArrayTree,
+    batch: Minibatch,
+    noise: Noise,
+) -> tuple[GroupState, tuple[chex.Array, chex.Array, chex.Array]]:
+    """One agent: (its state, (critic loss, Q, actor loss)). `state`: without the members' axis."""
+    algorithm, space = group.algorithm, group.action_space
+    actor = networks.actor_network((), algorithm.hidden, space)
+    critic = networks.critic_network(algorithm.num_critics, algorithm.hidden)
 
-    # y_i = r_i + gamma * min_j Q'_ij(x', mu'_1(o'_1) + epsilon, ..., mu'_N(o'_N) + epsilon)
-    next_inputs = _next_inputs(spec, block, mu_targets, hyper, batch, target_key)
-    next_q = apply(critic, state.critic_target, next_inputs)[..., 0].min(axis=1)
-    reward = jnp.moveaxis(batch.reward[..., list(members)], -1, 0)
-    reward = reward[:, 0] if batch.reward.shape[0] == 1 else _diagonal(reward)
-    y = reward + hyper.gamma * batch.discount * next_q
+    # a'_j = mu'_j(o'_j) + epsilon, one sample for all critics of the agent
+    if algorithm.critic == "central":
+        others = [(other, params, actor_of(other)) for other, params in zip(spec.groups, mu_targets, strict=True)]
+    else:
+        others = [(group, own_target, actor)]
+    parts = []
+    for j, (other, params, network) in enumerate(others):
+        output = apply(network, params, batch.next_observations[j])
+        part = networks.act(other.action_space, output, noise.target[j])
+        if noise.smoothing[j] is not None:
+            part = networks.smooth(
+                other.action_space, part, noise.smoothing[j], hyper.target_noise, hyper.target_noise_clip
+            )
+        parts.append(part)
+    next_action = spec.join_actions(parts) if algorithm.critic == "central" else parts[0]
+
+    # y_i = r_i + gamma * min_j Q'_ij(x', a'_1, ..., a'_N)
+    next_inputs = jnp.concatenate([batch.next_x, next_action], axis=-1)
+    next_q = apply(critic, state.critic_target, next_inputs)[..., 0].min(axis=0)
+    y = batch.reward + hyper.gamma * batch.discount * next_q
 
     def critic_loss(params):
-        q = apply(critic, params, _inputs(spec, block, batch))[..., 0]
-        loss = jnp.mean(jnp.square(q - y[:, None, :]), axis=-1)
-        return loss.sum(), (loss.mean(axis=1), q[:, 0].mean(axis=-1))
+        q = apply(critic, params, batch.inputs)[..., 0]
+        loss = jnp.mean(jnp.square(q - y), axis=-1)
+        return loss.sum(), (loss.mean(), q[0].mean())
 
-    gradients, (losses, q_values) = jax.grad(critic_loss, has_aux=True)(state.critic)
+    gradients, (loss, q_value) = jax.grad(critic_loss, has_aux=True)(state.critic)
     q_params, q_optimiser = optimiser.apply(
-        algorithm, state.critic, state.critic_optimiser, gradients, hyper.critic_lr, hyper.max_grad_norm, stack_ndim=2
+        algorithm, state.critic, state.critic_optimiser, gradients, hyper.critic_lr, hyper.max_grad_norm, stack_ndim=1
     )
     state = state._replace(critic=q_params, critic_optimiser=q_optimiser)
     if not move:
-        return state, UpdateMetrics(losses, q_values, jnp.full(m, jnp.nan))
+        return state, (loss, q_value, jnp.full((), jnp.nan))
 
     # -E[Q_i1(x, a_1, ..., mu_i(o_i), ..., a_N)] + regulariser: the own action anew, the others' from the replay
-    observation = _own(spec, batch.x, members, spec.observation_part)
-    draw = networks.policy_noise(action_key, group.action_space, observation.shape[:-1])
-    replayed = _own(spec, batch.action, members, spec.action_part)
-    first = networks.critic_network(m, 1, algorithm.hidden)
-    q1_params = jax.tree.map(lambda p: p[:, :1], state.critic)
-    inputs = _inputs(spec, block, batch)
-    if algorithm.critic == "central":
-        starts = [spec.observation_size + spec.action_starts[i] for i in members]
-    else:
-        starts = [group.observation_size] * m
+    first = networks.critic_network(1, algorithm.hidden)
+    q1_params = jax.tree.map(lambda p: p[:1], q_params)
 
     def actor_loss(params):
-        output = apply(actor, params, observation)
-        action = networks.act(group.action_space, output, draw)
-        q1 = apply(first, q1_params, inputs, ((action - replayed)[:, None], starts))
-        loss = -q1[:, 0, :, 0].mean(axis=-1) + hyper.logit_regulariser * jnp.mean(jnp.square(output), axis=(-2, -1))
-        return loss.sum(), loss
+        output = apply(actor, params, batch.observation)
+        action = networks.act(space, output, noise.action)
+        q1 = apply(first, q1_params, batch.inputs, action - batch.action, batch.action_column)
+        loss = -q1.mean() + hyper.logit_regulariser * jnp.mean(jnp.square(output))
+        return loss, loss
 
-    gradients, actor_losses = jax.grad(actor_loss, has_aux=True)(state.actor)
+    gradients, mu_loss = jax.grad(actor_loss, has_aux=True)(state.actor)
     mu_params, mu_optimiser = optimiser.apply(
-        algorithm, state.actor, state.actor_optimiser, gradients, hyper.actor_lr, hyper.max_grad_norm, stack_ndim=1
+        algorithm, state.actor, state.actor_optimiser, gradients, hyper.actor_lr, hyper.max_grad_norm, stack_ndim=0
     )
     # theta' <- tau theta + (1 - tau) theta'
     state = state._replace(
@@ -189,75 +233,61 @@ def _update_block(
         actor_target=optax.incremental_update(mu_params, state.actor_target, hyper.tau),
         critic_target=optax.incremental_update(q_params, state.critic_target, hyper.tau),
     )
-    return state, UpdateMetrics(losses, q_values, actor_losses)
+    return state, (loss, q_value, mu_loss)
 
 
-def _next_inputs(
-    spec: Spec,
-    block: Block,
-    mu_targets: Sequence[chex.ArrayTree],
-    hyper: HyperParams,
-    batch: RowParts,
-    key: chex.PRNGKey,
-) -> chex.Array:
-    """What the target critics of a block read: [members or 1, batch, critic inputs], the target actors' actions sampled
-    once for all critics of an agent."""
-    group = spec.groups[block.group]
-    smoothing = group.algorithm.smoothing
-    act_key, smooth_key = jax.random.split(key)
+def _minibatches(spec: Spec, group: Group, rows: chex.Array) -> Minibatch:
+    """The minibatches of a group's members, stacked."""
+    shared = rows.shape[0] == 1
+    central = group.algorithm.critic == "central"
 
-    def actions(other: Group, params: chex.ArrayTree, observation: chex.Array, number: int) -> chex.Array:
-        """[agents, ..., batch, action size] for observations of the same leading axes."""
-        space, lead = other.action_space, observation.shape[:-1]
-        flat = observation.reshape(lead[0], -1, observation.shape[-1])
-        network = networks.actor_network(lead[0], other.algorithm.hidden, space)
-        output = apply(network, params, flat).reshape(*lead, space.size)
-        action = networks.act(space, output, networks.policy_noise(jax.random.fold_in(act_key, number), space, lead))
-        if smoothing:
-            draw = jax.random.normal(jax.random.fold_in(smooth_key, number), action.shape)
-            action = networks.smooth(space, action, draw, hyper.target_noise, hyper.target_noise_clip)
-        return action
+    def one(i: int) -> Minibatch:
+        parts = spec.row_parts(rows[0 if shared else i])
+        observation = spec.observation_part(parts.x, i)
+        action = spec.action_part(parts.action, i)
+        own_next = spec.observation_part(parts.next_x, i)
+        every_next = tuple(
+            jnp.stack([spec.observation_part(parts.next_x, j) for j in other.members]) for other in spec.groups
+        )
+        column = spec.observation_size + spec.action_starts[i] if central else group.observation_size
+        return Minibatch(
+            observation=observation,
+            action=action,
+            inputs=parts.inputs if central else jnp.concatenate([observation, action], axis=-1),
+            reward=parts.reward[..., i],
+            discount=parts.discount,
+            next_observations=every_next if central else (own_next,),
+            next_x=parts.next_x if central else own_next,
+            action_column=jnp.int32(column),
+        )
 
-    if group.algorithm.critic == "own":
-        observation = _own(spec, batch.next_x, spec.members(block), spec.observation_part)
-        params = _slice(mu_targets[block.group], block)
-        return jnp.concatenate([observation, actions(group, params, observation, 0)], axis=-1)
-    parts = [
-        actions(other, params, spec.stack_observations(batch.next_x, other.members), number)
-        for number, (other, params) in enumerate(zip(spec.groups, mu_targets, strict=True))
-    ]
-    joint = jnp.concatenate([batch.next_x, spec.join_actions(parts)], axis=-1)
-    return joint[0] if joint.shape[0] == 1 < len(spec.members(block)) else joint
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(one(i) for i in group.members))
 
 
-def _inputs(spec: Spec, block: Block, batch: RowParts) -> chex.Array:
-    """What the critics of a block read of replayed transitions: [members, batch, inputs], or [batch, inputs] for all."""
-    members = spec.members(block)
-    if spec.groups[block.group].algorithm.critic == "own":
-        observation = _own(spec, batch.x, members, spec.observation_part)
-        return jnp.concatenate([observation, _own(spec, batch.action, members, spec.action_part)], axis=-1)
-    return batch.inputs[0] if batch.inputs.shape[0] == 1 < len(members) else batch.inputs
+def _noise(spec: Spec, group: Group, shape: tuple[int, int], key: chex.PRNGKey) -> Noise:
+    """The random numbers of a group's members; `shape`: minibatches (1: shared) and their size."""
+    batches, size = shape
+    members = len(group.members)
+    action_key, target_key, smooth_key = jax.random.split(key, 3)
+    wanted: list[tuple[ActionSpace, tuple[int, ...]]]
+    if group.algorithm.critic == "central":
+        wanted = [(other.action_space, (len(other.members), size)) for other in spec.groups]
+    else:
+        wanted, batches = [(group.action_space, (size,))], members  # nobody shares an own action
 
+    def draws(draw, key):
+        drawn = []
+        for j, (space, lead) in enumerate(wanted):
+            one = draw(jax.random.fold_in(key, j), space, (1 if batches == 1 else members, *lead))
+            # With a shared minibatch all agents look at the same target actions.
+            drawn.append(None if one is None else jnp.broadcast_to(one, (members, *one.shape[1:])))
+        return tuple(drawn)
 
-def _own(spec: Spec, joint: chex.Array, members: Sequence[int], part) -> chex.Array:
-    """Each member's own part [members, batch, size] of its own minibatch in joint [members or 1, batch, joint size]."""
-    shared = joint.shape[0] == 1
-    return jnp.stack([part(joint[0 if shared else k], i) for k, i in enumerate(members)])
+    def normal(key, space, lead):
+        return networks.flat_draw(jax.random.normal, key, (*lead, space.size)) if group.algorithm.smoothing else None
 
-
-def _diagonal(x: chex.Array) -> chex.Array:
-    """x [members, members, ...] to x[k, k]: each member's entry of its own minibatch."""
-    return jnp.stack([x[k, k] for k in range(x.shape[0])])
-
-
-def _slice(tree: chex.ArrayTree, block: Block) -> chex.ArrayTree:
-    return jax.tree.map(lambda leaf: leaf[block.start : block.stop] if leaf.ndim else leaf, tree)
-
-
-def _put(state: GroupState, block: Block, part: GroupState) -> GroupState:
-    def put(old, new):
-        if not old.ndim or old.shape == new.shape:
-            return new
-        return old.at[block.start : block.stop].set(new)
-
-    return jax.tree.map(put, state, part)
+    return Noise(
+        target=draws(networks.policy_noise, target_key),
+        smoothing=draws(normal, smooth_key),
+        action=networks.policy_noise(action_key, group.action_space, (members, size)),
+    )

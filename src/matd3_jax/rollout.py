@@ -98,7 +98,7 @@ def evaluate(
     episodes: int,
     deterministic: bool,
 ) -> tuple[chex.Array, chex.Array]:
-    """Undiscounted returns [episodes, num_agents] and lengths [episodes] of whole episodes, each in its own environment.
+    """Undiscounted returns [episodes, num_agents] and lengths [episodes] of whole episodes, each in an own environment.
 
     deterministic: no noise at all (softmax of the logits, likeliest choice, squashed output); otherwise the policies
     act as they do while collecting.

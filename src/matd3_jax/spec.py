@@ -23,15 +23,6 @@ class Group:
 
 
 @dataclasses.dataclass(frozen=True)
-class Block:
-    """The neighbouring members `start:stop` of group number `group`: what is updated together."""
-
-    group: int
-    start: int
-    stop: int
-
-
-@dataclasses.dataclass(frozen=True)
 class Spec:
     """Who learns, and the layout of joint vectors.
 
@@ -87,16 +78,10 @@ class Spec:
             members.setdefault(key, []).append(i)
         return tuple(Group(tuple(who), *key) for key, who in members.items())
 
-    def blocks(self, sequential: bool) -> tuple[Block, ...]:
-        """What one update goes through in turn: whole groups, or the agents one after the other in their order."""
-        if not sequential:
-            return tuple(Block(g, 0, len(group.members)) for g, group in enumerate(self.groups))
-        place = {i: Block(g, k, k + 1) for g, group in enumerate(self.groups) for k, i in enumerate(group.members)}
-        return tuple(place[i] for i in range(self.num_agents))
-
-    def members(self, block: Block) -> tuple[int, ...]:
-        """The agents of a block."""
-        return self.groups[block.group].members[block.start : block.stop]
+    def place(self, agent: int) -> tuple[int, int]:
+        """(group number, place among its members) of an agent."""
+        g = next(g for g, group in enumerate(self.groups) if agent in group.members)
+        return g, self.groups[g].members.index(agent)
 
     # ---- replay rows -------------------------------------------------------------------------------------------------
 
@@ -112,8 +97,8 @@ class Spec:
         next_x: chex.Array,
         terminated: chex.Array,
     ) -> chex.Array:
-        """Replay rows [..., row_size] of x [..., observation_size], action [..., action_size], reward [..., num_agents],
-        next_x [..., observation_size] and terminated [...]."""
+        """Replay rows [..., row_size] of x, next_x [..., observation_size], action [..., action_size],
+        reward [..., num_agents] and terminated [...]."""
         discount = 1.0 - terminated.astype(jnp.float32)[..., None]
         return jnp.concatenate([x, action, reward, next_x, discount], axis=-1, dtype=jnp.float32)
 
@@ -141,10 +126,6 @@ class Spec:
         """a_i [..., action size of the agent] of joint actions."""
         start = self.action_starts[agent]
         return action[..., start : start + self.action_spaces[agent].size]
-
-    def stack_observations(self, x: chex.Array, members: Sequence[int]) -> chex.Array:
-        """The members' observations [members, ...batch, size] of joint observations [...batch, observation_size]."""
-        return jnp.stack([self.observation_part(x, i) for i in members])
 
     def join_actions(self, parts: Sequence[chex.Array]) -> chex.Array:
         """Joint actions [..., action_size] from one array [members, ..., size] per group."""

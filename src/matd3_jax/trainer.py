@@ -4,7 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -103,7 +103,8 @@ class Trainer:
         self.mesh = Mesh(np.array(devices), ("seeds",))
         self.rows = math.ceil(num_seeds / len(devices)) * len(devices)
         """Seeds actually run: `num_seeds` filled up to a multiple of the devices with copies of the last one."""
-        self.piece = piece or (1 if devices[0].platform == "cpu" else self.rows // len(devices))
+        self.on_cpu = devices[0].platform == "cpu"
+        self.piece = piece or (1 if self.on_cpu else self.rows // len(devices))
         per_group = [hyper[spec.teams[group.members[0]]] for group in spec.groups]
         spread = [
             jax.tree.map(lambda h: jnp.broadcast_to(jnp.asarray(h, jnp.float32), num_seeds), h) for h in per_group
@@ -199,7 +200,7 @@ class Trainer:
     def _specs(self) -> TrainState:
         return TrainState(P("seeds"), P("seeds"), P("seeds"), P("seeds"), P())  # type: ignore[arg-type]
 
-    def _collect(self, state: TrainState, hyper, random: bool = False) -> tuple[TrainState, Episodes]:
+    def collect(self, state: TrainState, hyper, random: bool = False) -> tuple[TrainState, Episodes]:
         """One collect of all local seeds."""
 
         def one(groups, env, key, hyper):
@@ -215,20 +216,12 @@ class Trainer:
         return state, episodes
 
     @cached_property
-    def prefill(self) -> Callable[[TrainState], tuple[TrainState, Episodes]]:
+    def prefill(self) -> "Program":
         """Play `prefill_collects` collects without learning: (state, episodes [seeds, collects])."""
+        random = self.schedule.warmup == "random"
+        return self.program(partial(self.collect, random=random), self.schedule.prefill_collects)
 
-        def prefill(state, hyper):
-            random = self.schedule.warmup == "random"
-            state, episodes = jax.lax.scan(
-                lambda s, _: self._collect(s, hyper, random), state, length=self.schedule.prefill_collects
-            )
-            return state, _seeds_first(episodes)
-
-        program = self._program(prefill, (self._specs, P("seeds")))
-        return lambda state: program(state, self.hyper)
-
-    def _update(self, state: TrainState, hyper, first: int) -> tuple[TrainState, UpdateMetrics]:
+    def learn(self, state: TrainState, hyper, first: int) -> tuple[TrainState, UpdateMetrics]:
         """The updates after one collect, piece after piece of the local seeds; `first`: number of the first of them."""
         schedule, groups = self.schedule, self.spec.groups
         size = replay.filled(schedule.replay_capacity, schedule.collect_steps, state.collects)
@@ -242,7 +235,9 @@ class Trainer:
                 indices = replay.sample_indices(index_key, size, (batches, schedule.batch_size))
                 rows = replay.gather(state.replay, seed, indices)
                 move = [(first + u + 1) % group.algorithm.policy_delay == 0 for group in groups]
-                states, m = learner.update(self.spec, states, hyper, rows, update_key, move, schedule.sequential)
+                states, m = learner.update(
+                    self.spec, states, hyper, rows, update_key, move, schedule.sequential, one_by_one=self.on_cpu
+                )
                 metrics.append(m)
             return states, jax.tree.map(lambda *m: jnp.stack(m), *metrics)
 
@@ -260,34 +255,33 @@ class Trainer:
         states, metrics = jax.lax.map(one, (seeds, state.groups, keys[:, 0], hyper), batch_size=self.piece)
         return state._replace(groups=states, key=keys[:, 1]), metrics
 
-    def _cycle(self, state: TrainState, hyper) -> tuple[TrainState, Metrics]:
+    def cycle(self, state: TrainState, hyper) -> tuple[TrainState, Metrics]:
         episodes, metrics = [], []
         for c in range(self.cycle_collects):
-            state, e = self._collect(state, hyper)
-            state, m = self._update(state, hyper, first=c * self.schedule.updates_per_collect)
+            state, e = self.collect(state, hyper)
+            state, m = self.learn(state, hyper, first=c * self.schedule.updates_per_collect)
             episodes.append(e)
             metrics.append(m)
         total = jax.tree.map(lambda *e: sum(e), *episodes)
         mean = jax.tree.map(lambda *m: jnp.nanmean(jnp.concatenate(m, axis=1), axis=1), *metrics)
         return state, Metrics(total, mean)
 
-    def chunk(self, cycles: int) -> Callable[[TrainState], tuple[TrainState, Metrics]]:
+    def chunk(self, cycles: int) -> "Program":
         """The program of `cycles` cycles: (state, metrics [seeds, cycles]). The state given in is donated."""
-        program = self._chunk(cycles)
-        return lambda state: program(state, self.hyper)
+        return self.program(self.cycle, cycles)
 
-    def _chunk(self, cycles: int) -> Callable:
-        def chunk(state, hyper):
-            state, metrics = jax.lax.scan(lambda s, _: self._cycle(s, hyper), state, length=cycles)
-            return state, _seeds_first(metrics)
+    def program(self, cycle: Callable, cycles: int) -> "Program":
+        """`cycle`(state, hyper) -> (state, output) of the local seeds, repeated `cycles` times in one `lax.scan`."""
 
-        return self._program(chunk, (self._specs, P("seeds")))
+        def repeat(state, hyper):
+            state, outputs = jax.lax.scan(lambda s, _: cycle(s, hyper), state, length=cycles)
+            return state, jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), outputs)
 
-    def _program(self, f: Callable, in_specs) -> Callable:
-        return jax.jit(self._sharded(f, in_specs, (self._specs, P("seeds"))), donate_argnums=0)
+        specs = (self._specs, P("seeds"))
+        return Program(jax.jit(self._sharded(repeat, specs, specs), donate_argnums=0), self.hyper, cycles)
 
     def evaluate(self, state: TrainState, keys: chex.PRNGKey, episodes: int, deterministic: bool):
-        """`rollout.evaluate` of every seed: returns [num_seeds, episodes, num_agents], lengths [num_seeds, episodes]."""
+        """`rollout.evaluate` of each seed: returns [num_seeds, episodes, num_agents], lengths [num_seeds, episodes]."""
 
         def one(groups, hyper, key):
             actors = [group.actor for group in groups]
@@ -298,5 +292,12 @@ class Trainer:
         return returns[: self.num_seeds], lengths[: self.num_seeds]
 
 
-def _seeds_first(tree):
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), tree)
+class Program(NamedTuple):
+    """A compiled stretch of training: call it with a state, which it takes over."""
+
+    jitted: Any
+    hyper: tuple[HyperParams, ...]
+    cycles: int
+
+    def __call__(self, state: TrainState) -> tuple[TrainState, Any]:
+        return self.jitted(state, self.hyper)

@@ -2,7 +2,8 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -16,7 +17,7 @@ from matd3_jax.envs.joint import JointTeam
 from matd3_jax.errors import UserError
 from matd3_jax.rollout import Episodes
 from matd3_jax.spec import Spec
-from matd3_jax.trainer import Metrics, Schedule, Trainer, TrainState
+from matd3_jax.trainer import Metrics, Program, Schedule, Trainer, TrainState
 
 Row = dict[str, np.ndarray]
 """Columns of the metrics table for one chunk: each [seeds]; "step" and "seed" among them."""
@@ -83,7 +84,6 @@ class Training:
         capacity = min(config.replay_capacity, self.total_steps)
         schedule = dataclasses.replace(schedule, replay_capacity=capacity)
         self.trainer = Trainer(self.env, self.spec, schedule, hyper, config.seeds)
-        self._program: Callable | None = None
 
     # ---- memory ------------------------------------------------------------------------------------------------------
 
@@ -118,11 +118,14 @@ class Training:
         state, episodes = self.trainer.prefill(self.trainer.init(self.keys()))
         return state, self.row(state, Metrics(episodes, None))  # type: ignore[arg-type]
 
+    @cached_property
+    def chunk(self) -> Program:
+        """The program of one chunk: compiled once."""
+        return self.trainer.chunk(self.cycles_per_chunk)
+
     def advance(self, state: TrainState) -> tuple[TrainState, Row]:
         """One chunk. The state given in is donated."""
-        if self._program is None:
-            self._program = self.trainer.chunk(self.cycles_per_chunk)
-        state, metrics = self._program(state)
+        state, metrics = self.chunk(state)
         return state, self.row(state, metrics)
 
     def step(self, state: TrainState) -> int:
@@ -191,22 +194,16 @@ def train(
     if own is not None:
         config = dataclasses.replace(config, env={"name": type(own).__name__})
     training = Training(config, own)
-    state, rows = None, []
-    for state, row in training_chunks(training):
-        rows.append(row)
+    state, row = training.start()
+    rows = [row]
+    for _ in range(training.num_chunks):
         if callback is not None:
             callback(row)
-    assert state is not None
-    return Result(config, training, state, stack(rows))
-
-
-def training_chunks(training: Training) -> Iterator[tuple[TrainState, Row]]:
-    """The states and rows of a fresh run: after the prefill, then after every chunk."""
-    state, row = training.start()
-    yield state, row
-    for _ in range(training.num_chunks):
         state, row = training.advance(state)
-        yield state, row
+        rows.append(row)
+    if callback is not None:
+        callback(row)
+    return Result(config, training, state, stack(rows))
 
 
 def stack(rows: list[Row]) -> dict[str, np.ndarray]:

@@ -1,0 +1,149 @@
+"""`python -m experiments.cooperative_navigation`: does it learn what the original learns?
+
+    python -m experiments.cooperative_navigation [seeds=10] [total_steps=250000] [out=experiments/results/simple_spread]
+
+Trains MATD3 and MADDPG on simple_spread with the paper's settings (10,000 episodes of 25 steps) and lays the training
+returns over those of the authors' own program (experiments/reference). Writes the table of both (curves.csv), a figure
+(curves.png), a comparison (table.md) and the machine and versions (machine.json) into `out`.
+"""
+
+import csv
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+import matd3_jax
+from matd3_jax import command, config, devices
+from matd3_jax.plotting import curve
+
+HERE = Path(__file__).parent
+ALGORITHMS = {"matd3": "MATD3", "maddpg": "MADDPG"}
+EPISODE = 25
+BLOCK = 1000
+"""Episodes averaged into one point, as in the authors' tables: a single episode's return varies by about 75."""
+
+
+def main(argv: Sequence[str]) -> int:
+    taken, overrides = config.take(argv, ("seeds", "total_steps", "out"))
+    out = Path(taken.get("out", HERE / "results" / "simple_spread"))
+    devices.prepare()
+    out.mkdir(parents=True, exist_ok=True)
+    ours, seconds = {}, {}
+    for algo in ALGORITHMS:
+        begun = time.monotonic()
+        result = matd3_jax.train(
+            *overrides,
+            env="simple_spread",
+            algo=algo,
+            seeds=taken.get("seeds", 10),
+            total_steps=taken.get("total_steps", 250_000),
+            log_every=100 * EPISODE,
+            callback=lambda row, algo=algo: print(algo, int(row["step"][0]), row["return_agents"].mean(), flush=True),
+        )
+        seconds[algo] = round(time.monotonic() - begun, 1)
+        ours[algo] = result.metrics
+    _write_curves(out / "curves.csv", ours)
+    facts = {
+        "machine": devices.description(),
+        "versions": devices.versions(),
+        "seconds": seconds,
+        "settings": list(argv),
+    }
+    (out / "machine.json").write_text(json.dumps(facts, indent=1) + "\n")
+    report(out)
+    return 0
+
+
+def report(out: Path) -> None:
+    """Figure and table from curves.csv in `out` and the authors' curves."""
+    ours = {algo: blocks(*_ours(out / "curves.csv", algo)) for algo in ALGORITHMS}
+    theirs = {algo: blocks(*_authors(algo)) for algo in ALGORITHMS}
+    figure = Figure(figsize=(9.5, 3.8), layout="constrained")
+    FigureCanvasAgg(figure)
+    lines = [
+        "| algorithm | episodes | this project: mean (sd, seeds) | authors: mean (sd, seeds) | difference (95 %) |"
+    ]
+    lines.append("|---|---|---|---|---|")
+    for axis, algo in zip(figure.subplots(1, 2, sharey=True), ALGORITHMS, strict=True):
+        episodes, mine = ours[algo]
+        axis.plot(theirs[algo][0], theirs[algo][1].T, color="black", linewidth=0.9, alpha=0.6)
+        axis.plot([], [], color="black", linewidth=0.9, label=f"authors' program, {len(theirs[algo][1])} seeds, each")
+        curve(axis, episodes, mine, "tab:blue", f"this project, {len(mine)} seeds, mean and 95 % interval", each=True)
+        axis.set_title(f"Cooperative Navigation: {ALGORITHMS[algo]}")
+        axis.set_xlabel(f"episodes (mean over the last {BLOCK:,})")
+        axis.legend(loc="lower right", frameon=False, fontsize=8)
+        for k, episode in enumerate(episodes):
+            if episode not in theirs[algo][0] or (episode // BLOCK) % 2 and episode != BLOCK:
+                continue
+            other = theirs[algo][1][:, list(theirs[algo][0]).index(episode)]
+            other, a = other[~np.isnan(other)], mine[:, k]
+            cells = [ALGORITHMS[algo], f"{episode:,}"]
+            cells += [f"{v.mean():.1f} ({v.std(ddof=1):.1f}, {len(v)})" for v in (a, other)]
+            lines.append(f"| {' | '.join(cells)} | {a.mean() - other.mean():+.1f} ± {_welch(a, other):.1f} |")
+    figure.axes[0].set_ylabel("training return, summed over agents")
+    figure.savefig(out / "curves.png", dpi=130)
+    (out / "table.md").write_text("\n".join(lines) + "\n")
+    print("\n".join(lines))
+
+
+def blocks(episode: np.ndarray, curves: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Means over blocks of `BLOCK` episodes: (last episode of each block, means [seeds, blocks]).
+
+    Args:
+        episode: [rows] last episode of each row; curves: [seeds, rows] mean returns; weights: [rows] episodes in a row.
+    """
+    ends = np.arange(BLOCK, episode[-1] + 1, BLOCK)
+    inside = (episode[None] > ends[:, None] - BLOCK + weights / 2) & (episode[None] <= ends[:, None] + weights / 2)
+    share = inside * weights
+    return ends, curves @ (share / share.sum(axis=1, keepdims=True)).T
+
+
+def _ours(path: Path, algo: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    with path.open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["algo"] == algo]
+    seeds = sorted({int(row["seed"]) for row in rows})
+    by_seed = [[row for row in rows if int(row["seed"]) == seed] for seed in seeds]
+    episode = np.array([int(row["step"]) / EPISODE for row in by_seed[0]])
+    weights = np.array([float(row["episodes"]) for row in by_seed[0]])
+    return episode, np.array([[float(row["return"]) for row in rows] for rows in by_seed]), weights
+
+
+def _authors(algo: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Up to 10,000 episodes, which all four seeds played."""
+    with (HERE / "reference" / f"simple_spread_{algo}.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if int(row["episode"]) <= 10_000]
+    seeds = sorted({row["seed"] for row in rows})
+    curves = np.array([[float(row["mean_return_sum"]) for row in rows if row["seed"] == seed] for seed in seeds])
+    episode = np.array([int(row["episode"]) for row in rows if row["seed"] == seeds[0]])
+    return episode, curves, np.full(len(episode), 100.0)
+
+
+def _write_curves(path: Path, metrics: dict[str, dict[str, np.ndarray]]) -> None:
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(("algo", "seed", "step", "episodes", "return"))
+        for algo, columns in metrics.items():
+            for i in range(columns["step"].shape[0]):
+                for k in range(columns["step"].shape[1]):
+                    cells = [columns[name][i, k] for name in ("seed", "step", "episodes")]
+                    writer.writerow((algo, *cells, f"{columns['return_agents'][i, k]:.4f}"))
+
+
+def _welch(a: np.ndarray, b: np.ndarray) -> float:
+    """Half width of the 95 % interval of the difference of two means (Welch)."""
+    from scipy.special import stdtrit
+
+    va, vb = a.var(ddof=1) / len(a), b.var(ddof=1) / len(b)
+    freedom = (va + vb) ** 2 / (va**2 / (len(a) - 1) + vb**2 / (len(b) - 1))
+    return float(stdtrit(freedom, 0.975) * np.sqrt(va + vb))
+
+
+if __name__ == "__main__":
+    sys.argv[0] = "cooperative_navigation"
+    command.run(main)

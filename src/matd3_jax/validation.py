@@ -1,0 +1,83 @@
+"""Which settings are impossible, alone or together."""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+from matd3_jax.errors import UserError
+
+if TYPE_CHECKING:
+    from matd3_jax.config import AlgoConfig, Config
+
+CHOICES = {
+    "critic": ("central", "own"),
+    "clip": ("variable", "network", "none"),
+    "adam": ("standard", "epsilon_hat"),
+    "update_order": ("simultaneous", "sequential"),
+    "warmup": ("policy", "random"),
+}
+
+
+def check(config: "Config") -> None:
+    """Raise UserError for the first value, or combination of values, that is impossible."""
+
+    def need(ok: bool, message: str) -> None:
+        if not ok:
+            raise UserError(message)
+
+    for key in ("total_steps", "seeds", "num_envs", "rollout_length", "updates_per_collect", "batch_size",
+                "replay_capacity", "learning_starts", "keep_checkpoints"):  # fmt: skip
+        need(getattr(config, key) >= 1, f"{key}={getattr(config, key)}: must be at least 1")
+    need(0 <= config.seed < 2**31, f"seed={config.seed}: must be between 0 and {2**31 - 1}")
+    for key in ("log_every", "checkpoint_every"):
+        value = getattr(config, key)
+        need(value is None or value >= (key == "log_every"), f"{key}={value}: must be positive")
+    for name, team in {"algo": config.algo, "adversary": config.adversary}.items():
+        if team is not None:
+            _check_team(name, team, config.updates_per_collect, need)
+    _check_choices("", config, need)
+    collect = config.num_envs * config.rollout_length
+    need(
+        config.batch_size <= config.replay_capacity,
+        f"batch_size={config.batch_size} is larger than replay_capacity={config.replay_capacity}",
+    )
+    need(
+        config.learning_starts <= config.replay_capacity,
+        f"learning_starts={config.learning_starts} is larger than replay_capacity={config.replay_capacity}: "
+        "learning would never start",
+    )
+    need(
+        config.replay_capacity % collect == 0,
+        f"replay_capacity={config.replay_capacity} is not a multiple of the {collect} transitions of one collect "
+        f"(num_envs={config.num_envs} x rollout_length={config.rollout_length}); "
+        f"nearest: {max(1, round(config.replay_capacity / collect)) * collect}",
+    )
+    need(
+        config.total_steps >= config.learning_starts,
+        f"total_steps={config.total_steps} ends before learning starts (learning_starts={config.learning_starts})",
+    )
+
+
+def _check_team(name: str, team: "AlgoConfig", updates: int, need: Any) -> None:
+    for key in ("num_critics", "policy_delay"):
+        need(getattr(team, key) >= 1, f"{name}.{key}={getattr(team, key)}: must be at least 1")
+    need(
+        updates % team.policy_delay == 0 or team.policy_delay % updates == 0,
+        f"updates_per_collect={updates} is not a multiple of {name}.policy_delay={team.policy_delay} (nor divides it)",
+    )
+    for key in ("actor_lr", "critic_lr", "max_grad_norm"):
+        value = getattr(team, key)
+        need(0 < value < math.inf, f"{name}.{key}={value}: must be positive")
+    for key in ("target_noise", "target_noise_clip", "logit_regulariser", "exploration_noise"):
+        value = getattr(team, key)
+        need(0 <= value < math.inf, f"{name}.{key}={value}: must not be negative")
+    for key in ("gamma", "tau"):
+        value = getattr(team, key)
+        need(0 <= value <= 1, f"{name}.{key}={value}: must lie between 0 and 1")
+    need(all(width >= 1 for width in team.hidden), f"{name}.hidden={list(team.hidden)}: widths must be at least 1")
+    _check_choices(name + ".", team, need)
+
+
+def _check_choices(prefix: str, part: Any, need: Any) -> None:
+    for key, allowed in CHOICES.items():
+        value = getattr(part, key, allowed[0])
+        need(value in allowed, f"{prefix}{key}={value!r}: must be one of {', '.join(allowed)}")
