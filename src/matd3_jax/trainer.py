@@ -253,7 +253,11 @@ class Trainer:
         keys = jax.vmap(partial(jax.random.split, num=2))(state.key)
         seeds = jnp.arange(keys.shape[0])
         states, metrics = jax.lax.map(one, (seeds, state.groups, keys[:, 0], hyper), batch_size=self.piece)
-        return state._replace(groups=states, key=keys[:, 1]), metrics
+        # The next collect writes where these updates read. Where the actor is delayed nothing else tells XLA to do one
+        # after the other, and it would copy the whole replay: so let the count of collects, hence the place of the next
+        # write, hang on the updates. A mean squared error is never negative; XLA does not know.
+        wait = jnp.any(metrics.critic_loss < 0).astype(jnp.int32)
+        return state._replace(groups=states, key=keys[:, 1], collects=state.collects + wait), metrics
 
     def cycle(self, state: TrainState, hyper) -> tuple[TrainState, Metrics]:
         episodes, metrics = [], []
