@@ -166,7 +166,7 @@ class Training:
     def evaluate(self, state: TrainState, episodes: int, deterministic: bool, seed: int = 0) -> np.ndarray:
         """Undiscounted returns [seeds, episodes, agents] of whole episodes; every seed starts from the same keys."""
         keys = jax.vmap(lambda _: jax.random.key(seed))(np.arange(self.config.seeds))
-        return np.asarray(self.trainer.evaluate(state, keys, episodes, deterministic)[0])
+        return np.asarray(self.trainer.evaluate(state, keys, episodes, deterministic)[0], np.float64)
 
 
 def train(

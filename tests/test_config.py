@@ -1,0 +1,169 @@
+"""Settings: what the files say, what overrides do, and one clear line for every mistake."""
+
+import dataclasses
+
+import pytest
+
+from matd3_jax import config, envs
+from matd3_jax.errors import UserError
+from matd3_jax.training import Training
+
+PAPER = {
+    "actor_lr": 0.01,
+    "critic_lr": 0.01,
+    "gamma": 0.95,
+    "tau": 0.01,
+    "hidden": (64, 64),
+    "clip": "variable",
+    "max_grad_norm": 0.5,
+    "logit_regulariser": 1e-3,
+    "target_noise": 0.0,
+    "target_noise_clip": 0.5,
+}
+FAMILY = {  # joint, critic, number of critics, policy delay
+    "matd3": (False, "central", 2, 2),
+    "maddpg": (False, "central", 1, 1),
+    "iltd3": (False, "own", 2, 2),
+    "iddpg": (False, "own", 1, 1),
+    "td3": (True, "own", 2, 2),
+    "ddpg": (True, "own", 1, 1),
+}
+
+
+@pytest.mark.parametrize("name", FAMILY)
+def test_every_algorithm_has_the_papers_settings(name):
+    algo = config.load([f"algo={name}"]).algo
+    assert (algo.joint, algo.critic, algo.num_critics, algo.policy_delay) == FAMILY[name]
+    assert {key: getattr(algo, key) for key in PAPER} == PAPER
+    assert algo.name == name
+
+
+def test_the_default_schedule_is_the_papers():
+    settings = config.load()
+    assert settings.num_envs * settings.rollout_length == 100 and settings.updates_per_collect == 1
+    assert (settings.batch_size, settings.replay_capacity, settings.learning_starts) == (1024, 1_000_000, 25_600)
+    assert settings.total_steps == 60_000 * 25
+    trainer = Training(settings).trainer
+    # 2,245 updates by env step 250,000 (the authors' program), counted through this project's own schedule.
+    assert trainer.updates(250_000 // 100) == 2245
+
+
+@pytest.mark.parametrize("name", [n for n in envs.names()])
+def test_every_environment_has_a_file_that_lists_its_options_and_defaults(name):
+    env = dict(config.load([f"env={name}"]).env)
+    assert env.pop("name") == name
+    assert env == envs.options(name)
+
+
+def test_files_of_algorithms_and_environments_are_all_known():
+    assert set(config.known_names("algo")) == set(FAMILY)
+    assert set(config.known_names("env")) == set(envs.names())
+
+
+def test_adversary_takes_a_file_of_its_own():
+    settings = config.load(["env=simple_tag", "algo=matd3", "adversary=maddpg", "algo.lr=0.003"])
+    teams = settings.teams()
+    assert (teams["agents"].name, teams["adversaries"].name) == ("matd3", "maddpg")
+    assert (teams["agents"].actor_lr, teams["adversaries"].actor_lr) == (0.003, 0.01)
+
+
+def test_adversary_values_alone_keep_the_algorithm_and_its_other_values():
+    settings = config.load(["env=simple_tag", "algo=iltd3", "algo.tau=0.02", "adversary.lr=0.001"])
+    assert settings.adversary == dataclasses.replace(settings.algo, actor_lr=0.001, critic_lr=0.001)
+    assert settings.algo.tau == 0.02
+
+
+def test_without_adversary_both_teams_share_all_values():
+    teams = config.load(["env=simple_tag", "algo.lr=0.003"]).teams()
+    assert teams["agents"] == teams["adversaries"]
+
+
+def test_lr_sets_both_and_either_can_be_set():
+    algo = config.load(["algo.lr=0.1", "algo.critic_lr=0.2"]).algo
+    assert (algo.actor_lr, algo.critic_lr) == (0.1, 0.2)
+
+
+def test_written_settings_read_back_the_same(tmp_path):
+    settings = config.load(["env=simple_tag", "adversary=iddpg", "algo.hidden=[8]", "total_steps=1e6"])
+    config.write(settings, tmp_path / "config.yaml")
+    assert config.read(tmp_path / "config.yaml") == settings
+
+
+MISTAKES = {
+    "algo=mad3": "matd3",
+    "env=simple_sprad": "simple_spread",
+    "adversary=madpg": "maddpg",
+    "algo.lrr=1": "'lr'",
+    "lr=0.1": "'algo.lr'",
+    "rules=mpe2": "'env.rules'",
+    "algo.batch_size=2": "'batch_size'",
+    "env.rles=orig": "'rules'",
+    "totalsteps=3": "'total_steps'",
+    "seeds=0": "seeds=0",
+    "seeds=1.5": "seeds=1.5",
+    "seeds=-1": "seeds=-1",
+    "seed=-1": "seed=-1",
+    "seeds=true": "seeds=True",
+    "seeds=": "seeds",
+    "seeds": "key=value",
+    "seeds=1,2": "one value",
+    "algo.lr=fast": "fast",
+    "algo.lr=0": "algo.actor_lr=0",
+    "algo.lr=nan": "nan",
+    "algo.gamma=1.1": "gamma",
+    "algo.tau=-1": "tau",
+    "algo.policy_delay=0": "policy_delay=0",
+    "algo.num_critics=0": "num_critics=0",
+    "algo.hidden=64": "hidden",
+    "algo.hidden=[0]": "hidden",
+    "algo.clip=global": "variable, network, none",
+    "algo.critic=joint": "central, own",
+    "update_order=random": "simultaneous, sequential",
+    "warmup=none": "policy, random",
+    "updates_per_collect=3": "policy_delay=2",
+    "updates_per_collect=0": "updates_per_collect=0",
+    "batch_size=2000000": "replay_capacity",
+    "replay_capacity=25650": "multiple",
+    "replay_capacity=1000": "larger than replay_capacity",
+    "learning_starts=0": "learning_starts=0",
+    "total_steps=1000": "learning_starts",
+    "total_steps=0": "total_steps=0",
+    "log_every=0": "log_every",
+    "keep_checkpoints=0": "keep_checkpoints=0",
+    "algo.lr=${nothing}": "nothing",
+    "=3": "key",
+}
+
+
+@pytest.mark.parametrize("text", MISTAKES)
+def test_every_mistake_gives_one_line_that_names_it(text):
+    with pytest.raises(UserError) as error:
+        config.load([text])
+    assert MISTAKES[text] in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "names"),
+    [
+        (["adversary=maddpg"], "no adversaries"),
+        (["env.rules=mpe"], "rules"),
+        (["env.num_agents=0"], "num_agents"),
+        (["env.local_ratio=0.5"], "local_ratio"),
+    ],
+)
+def test_what_the_environment_does_not_take_is_named(overrides, names):
+    with pytest.raises(ValueError, match=names):
+        Training(config.load(overrides))
+
+
+def test_a_replay_that_cannot_fit_is_refused_with_the_arithmetic():
+    training = Training(config.load(["seeds=20000", "total_steps=2000000"]))
+    with pytest.raises(UserError, match=r"20000 seeds x 1,000,000 transitions x 127 numbers x 4 bytes = 10160.00 GB"):
+        training.check_memory()
+
+
+def test_a_short_run_allocates_no_rows_it_would_never_write():
+    training = Training(config.load(["seeds=2", "total_steps=100000"]))
+    assert training.trainer.schedule.replay_capacity == training.total_steps < 101_000
+    assert training.trainer.replay_bytes == 2 * training.total_steps * 127 * 4

@@ -1,0 +1,249 @@
+"""The commands: what a run leaves, resuming to the bit, signals, damage, bad input that writes nothing."""
+
+import csv
+import importlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from matd3_jax import checkpoint, command, evaluate
+from matd3_jax.errors import UserError
+
+train = importlib.import_module("matd3_jax.train")  # the name in the package is the function
+
+# A schedule and networks so small that a run takes a second; every part of the real one is there, two teams included.
+TINY = [
+    "env=simple_push", "adversary=maddpg", "seeds=3", "algo.hidden=[8]", "adversary.hidden=[8]", "batch_size=16",
+    "num_envs=2", "learning_starts=200", "replay_capacity=500", "total_steps=1500", "log_every=200",
+]  # fmt: skip
+
+
+def run(out: Path, *more: str) -> int:
+    return train.main([*TINY, f"out={out}", *more])
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with (path / "metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def leaves(path: Path) -> dict[str, np.ndarray]:
+    """Every array of the last checkpoint."""
+    import orbax.checkpoint as ocp
+
+    folder = checkpoint.verify(path / "checkpoints")
+    with ocp.StandardCheckpointer() as reader:
+        found = dict(reader.restore(folder / "state"))
+        for seed in sorted((folder / "replay").iterdir()):
+            found[f"replay {seed.name}"] = reader.restore(seed)["rows"]
+    return {name: np.asarray(leaf) for name, leaf in found.items()}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """A run that was never stopped, with checkpoints on the way."""
+    out = tmp_path_factory.mktemp("runs")
+    assert run(out, "name=whole", "checkpoint_every=400", "keep_checkpoints=3") == 0
+    return out / "whole"
+
+
+def test_a_run_leaves_all_its_files(whole):
+    assert {p.name for p in whole.iterdir()} == {
+        "config.yaml", "machine.json", "metrics.csv", "checkpoints", "learning_curve.png", "summary.json",
+    }  # fmt: skip
+    machine = json.loads((whole / "machine.json").read_text())
+    assert machine["versions"]["jax"] and machine["devices"]
+    assert (whole / "learning_curve.png").read_bytes()[:4] == b"\x89PNG"
+    assert len(checkpoint.steps(whole / "checkpoints")) == 3
+
+
+def test_the_metrics_table_is_tidy(whole):
+    """One row for each seed and chunk, steps ascending, everything counted."""
+    table = rows(whole)
+    steps = sorted({int(row["step"]) for row in table})
+    assert [(int(row["step"]), int(row["seed"])) for row in table] == [(s, seed) for s in steps for seed in range(3)]
+    assert steps[0] == 150 and steps[-1] >= 1500  # prefill: one collect of 50 before 200 transitions are reached
+    for row in table:
+        # 25-step episodes in two environments: as many have ended as steps were played.
+        assert int(row["updates"]) == max(0, int(row["step"]) - 150) // 50
+        assert float(row["episode_length"]) == 25
+        assert float(row["return_agents"]) == pytest.approx(float(row["agent_0_return"]))
+        assert float(row["return_adversaries"]) == pytest.approx(float(row["adversary_0_return"]))
+    assert sum(int(row["episodes"]) for row in table if row["seed"] == "1") == steps[-1] // 25
+    late = [row for row in table if int(row["step"]) > 150]
+    assert all(np.isfinite(float(row["agent_0_critic_loss"])) for row in late)
+
+
+def test_stopped_and_resumed_is_the_same_to_the_bit(whole, tmp_path, monkeypatch, capsys):
+    """SIGTERM comes in the middle; the resumed run ends in the same table and the same checkpoint, bit for bit."""
+    append = train.RunDirectory.append
+
+    def append_and_signal(self, row):
+        append(self, row)
+        if int(row["step"][0]) == 750:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(train.RunDirectory, "append", append_and_signal)
+    assert run(tmp_path, "name=cut") == 128 + signal.SIGTERM
+    monkeypatch.undo()
+    cut = tmp_path / "cut"
+    assert (
+        f"stopped by SIGTERM at env step 750; go on with: python -m matd3_jax.train resume={cut}"
+        in capsys.readouterr().out
+    )
+    assert checkpoint.steps(cut / "checkpoints")[-1] == 750
+    # A row that was written after the checkpoint, as by a run that died, is written anew and not twice.
+    with (cut / "metrics.csv").open("a") as file:
+        file.write(",".join(["950"] + ["0"] * (len(rows(cut)[0]) - 1)) + "\n")
+    assert train.main([f"resume={cut}"]) == 0
+    assert (cut / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
+    ours, theirs = leaves(cut), leaves(whole)
+    assert ours.keys() == theirs.keys() and any("optimiser" in name for name in ours)
+    for name in ours:
+        np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
+    assert np.abs(ours["replay 2"]).max(axis=1).min() > 0 and len(ours["replay 2"]) == 500
+
+
+def test_a_finished_run_can_be_lengthened(tmp_path):
+    """Beyond the first end: the replay rows not allocated before are there, and the settings say so."""
+    small = ["env=point_reach", "algo=iddpg", "seeds=1", "algo.hidden=[8]", "batch_size=16", "learning_starts=100"]
+    assert train.main([*small, f"out={tmp_path}", "name=longer", "total_steps=400", "log_every=100"]) == 0
+    longer = tmp_path / "longer"
+    end = int(rows(longer)[-1]["step"])
+    before = leaves(longer)["replay 0"]
+    assert train.main([f"resume={longer}", "total_steps=900"]) == 0
+    assert int(rows(longer)[-1]["step"]) >= 900 > end == len(before)
+    after = leaves(longer)["replay 0"]
+    assert len(after) == int(rows(longer)[-1]["step"]) and np.abs(after).max(axis=1).min() > 0
+    np.testing.assert_array_equal(after[:end], before)
+
+
+def test_damage_is_named_and_the_checkpoint_before_it_used_on_request(whole, tmp_path, capsys):
+    run(tmp_path, "name=damaged", "checkpoint_every=400", "keep_checkpoints=3")
+    damaged = tmp_path / "damaged"
+    found = checkpoint.steps(damaged / "checkpoints")
+    victim = max((damaged / "checkpoints" / str(found[-1]) / "replay").rglob("*"), key=lambda p: p.stat().st_size)
+    data = bytearray(victim.read_bytes())
+    data[len(data) // 2] ^= 1
+    victim.write_bytes(data)
+    before = {p: p.stat().st_mtime_ns for p in damaged.rglob("*")}
+    with pytest.raises(UserError) as error:
+        train.main([f"resume={damaged}", "total_steps=2000"])
+    assert victim.name in str(error.value) and f"checkpoint={found[-2]}" in str(error.value)
+    assert before == {p: p.stat().st_mtime_ns for p in damaged.rglob("*")}
+    assert train.main([f"resume={damaged}", f"checkpoint={found[-2]}"]) == 0
+    assert (damaged / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
+
+
+def test_a_missing_checksum_file_is_damage(whole, tmp_path):
+    copy = tmp_path / "checkpoints" / "400"
+    copy.mkdir(parents=True)
+    with pytest.raises(UserError, match="checksums.json"):
+        checkpoint.verify(tmp_path / "checkpoints")
+
+
+def test_tensorboard_files_hold_the_table(whole, tmp_path):
+    tensorboardX = pytest.importorskip("tensorboardX", exc_type=ImportError)
+    assert tensorboardX
+    assert run(tmp_path, "name=tb", "tensorboard=true") == 0
+    events = list((tmp_path / "tb" / "tensorboard").glob("events*"))
+    assert len(events) == 1 and b"return_agents/seed_2" in events[0].read_bytes()
+
+
+def test_evaluate_prints_and_leaves_a_table(whole, capsys):
+    assert evaluate.main([f"run={whole}", "episodes=20"]) == 0
+    printed = capsys.readouterr().out
+    with (whole / "evaluation.csv").open(newline="") as file:
+        table = list(csv.DictReader(file))
+    who = ["adversary_0", "agent_0", "team adversaries", "team agents"]
+    assert [(r["policy"], r["who"], r["seed"]) for r in table] == [
+        (policy, name, str(seed)) for policy in ("deterministic", "sampled") for name in who for seed in range(3)
+    ]
+    assert all(word in printed for word in ("deterministic", "sampled", "team adversaries", "seed 2"))
+    values = {(r["policy"], r["who"], r["seed"]): float(r["mean_return"]) for r in table}
+    assert values["deterministic", "agent_0", "0"] != values["sampled", "agent_0", "0"]
+    assert values["sampled", "agent_0", "1"] == values["sampled", "team agents", "1"]
+    # The same start states and policies again: the same numbers.
+    before = (whole / "evaluation.csv").read_bytes()
+    evaluate.main([f"run={whole}", "episodes=20"])
+    assert (whole / "evaluation.csv").read_bytes() == before
+
+
+BAD = {
+    "run directory that exists": (["name=whole"], "is there already"),
+    "unknown key": (["sedes=3"], "seeds"),
+    "no such run": (["resume=nowhere"], "no run directory nowhere"),
+    "not a run": (["resume={whole}/checkpoints"], "no config.yaml"),
+    "changed settings": (["resume={whole}", "algo.lr=1"], "algo.lr=1"),
+    "finished": (["resume={whole}"], "total_steps"),
+    "no such checkpoint": (["resume={whole}", "checkpoint=7", "total_steps=9000"], "no checkpoint of step 7"),
+    "checkpoint of what": (["checkpoint=700"], "resume="),
+    "checkpoint=last": (["resume={whole}", "checkpoint=last"], "checkpoint='last'"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_to_train_writes_nothing(case, whole, monkeypatch):
+    arguments, wanted = BAD[case]
+    before = {p: p.stat().st_mtime_ns for p in whole.parent.rglob("*")}
+    tiny = [] if any(a.startswith("resume") for a in arguments) else [*TINY, f"out={whole.parent}"]
+    with pytest.raises(UserError, match=wanted.replace("(", r"\(")):
+        train.main([*tiny, *(a.format(whole=whole) for a in arguments)])
+    assert before == {p: p.stat().st_mtime_ns for p in whole.parent.rglob("*")}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "wanted"),
+    [
+        ([], "run=RUN_DIR"),
+        (["run=nowhere"], "no run directory nowhere"),
+        (["run={whole}", "episods=3"], "episodes"),
+        (["run={whole}", "episodes=0"], "episodes=0"),
+        (["run={whole}", "checkpoint=7"], "no checkpoint of step 7"),
+    ],
+)
+def test_bad_input_to_evaluate(arguments, wanted, whole):
+    with pytest.raises(UserError, match=wanted):
+        evaluate.main([a.format(whole=whole) for a in arguments])
+
+
+def test_mistakes_end_with_one_line_and_exit_code_2(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(sys, "argv", ["train", "env=simple_sprad", f"out={tmp_path}"])
+    with pytest.raises(SystemExit) as end:
+        command.run(train.main)
+    printed = capsys.readouterr()
+    assert end.value.code == 2 and printed.out == ""
+    assert printed.err.startswith("error: ") and printed.err.count("\n") == 1 and "simple_spread" in printed.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_real_process_stops_at_sigint_with_a_checkpoint(tmp_path):
+    """As a user would: the module by name, control-C while it runs, then the printed line."""
+    words = [sys.executable, "-m", "matd3_jax.train", *TINY, "name=live", f"out={tmp_path}", "total_steps=100000000"]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    metrics = tmp_path / "live" / "metrics.csv"
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and not (metrics.exists() and metrics.read_text().count("\n") > 3):
+        time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 130, err
+    assert "Traceback" not in err
+    assert "stopped by SIGINT at env step" in out and f"resume={tmp_path / 'live'}" in out
+    assert checkpoint.verify(tmp_path / "live" / "checkpoints").is_dir()
+
+
+def test_help_and_cfg_write_nothing(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert train.main(["--help"]) == 0
+    assert "learning_starts: 25600" in capsys.readouterr().out
+    assert train.main(["--cfg", "algo.lr=0.5"]) == 0
+    assert "actor_lr: 0.5" in capsys.readouterr().out
+    assert not list(tmp_path.iterdir())
