@@ -141,7 +141,7 @@ def _choose(logits: chex.Array, soft: bool) -> chex.Array:
     if soft:
         return sample
     hard = jax.nn.one_hot(jnp.argmax(sample, -1), sample.shape[-1], dtype=sample.dtype)
-    return hard + sample - jax.lax.stop_gradient(sample)
+    return hard + (sample - jax.lax.stop_gradient(sample))  # the bracket is exactly 0: the choice stays one-hot
 
 
 def to_env(space: ActionSpace, action: chex.Array) -> chex.Array:

@@ -64,7 +64,7 @@ def collect(
     noise = _noise(spec, noise_key, (length, num_envs), random)
 
     def step(carry: EnvState, inputs):
-        draws, step_keys, reset_keys = inputs
+        draws, step_keys, fresh = inputs
         action = spec.join_actions(draws) if random else act(spec, actors, hyper, carry.observation, draws)
         after = jax.vmap(env.step)(step_keys, carry.state, env_actions(spec, action))
         x, next_x = (jnp.concatenate(o, axis=-1) for o in (carry.observation, after.observation))
@@ -75,7 +75,6 @@ def collect(
         episodes = Episodes(
             ended.sum(), jnp.where(ended[:, None], returns, 0).sum(axis=0), jnp.where(ended, steps, 0).sum()
         )
-        fresh = jax.vmap(env.reset)(reset_keys)
         state, observation = jax.tree.map(
             lambda new, old: jnp.where(ended.reshape(ended.shape + (1,) * (old.ndim - 1)), new, old),
             fresh,
@@ -84,8 +83,10 @@ def collect(
         carry = EnvState(state, observation, jnp.where(ended[:, None], 0, returns), jnp.where(ended, 0, steps))
         return carry, (rows, episodes)
 
-    keys = jax.random.split(step_key, (length, num_envs)), jax.random.split(reset_key, (length, num_envs))
-    env_state, (rows, episodes) = jax.lax.scan(step, env_state, (noise, *keys))
+    step_keys, reset_keys = (jax.random.split(k, (length, num_envs)) for k in (step_key, reset_key))
+    # Every step has a fresh start at hand, drawn in one batch: inside the loop it would be drawn as often, in small ones.
+    fresh = jax.vmap(jax.vmap(env.reset))(reset_keys)
+    env_state, (rows, episodes) = jax.lax.scan(step, env_state, (noise, step_keys, fresh))
     return env_state, rows.reshape(length * num_envs, -1), jax.tree.map(lambda e: e.sum(axis=0), episodes)
 
 

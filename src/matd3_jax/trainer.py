@@ -99,6 +99,11 @@ class Trainer:
         piece: int | None = None,
     ):
         self.env, self.spec, self.schedule, self.num_seeds = env, spec, schedule, num_seeds
+        updates = schedule.updates_per_collect
+        for group in spec.groups:
+            delay = group.algorithm.policy_delay
+            if updates % delay and delay % updates:
+                raise ValueError(f"updates_per_collect={updates} and policy_delay={delay}: one must divide the other")
         devices = list(jax.devices() if devices is None else devices)[:num_seeds]
         self.mesh = Mesh(np.array(devices), ("seeds",))
         self.rows = math.ceil(num_seeds / len(devices)) * len(devices)

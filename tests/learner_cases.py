@@ -1,0 +1,182 @@
+"""Teams, algorithms and schedules for test_learner, and the way between stacked states and the reference's agents."""
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+
+import jax
+import numpy as np
+import optax
+import reference
+
+from matd3_jax import config, learner
+from matd3_jax.envs import Box, Simplex, make
+from matd3_jax.envs.joint import JointTeam
+from matd3_jax.spec import Spec
+
+BATCH = 7
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """One configuration of `learner.update`; algorithms by name, `changes` of theirs by field."""
+
+    env: str
+    algo: str
+    adversary: str | None = None
+    options: Mapping = dataclasses.field(default_factory=dict)
+    changes: Mapping = dataclasses.field(default_factory=dict)
+    shared: bool = False
+    sequential: bool = False
+    still: tuple[str, ...] = ()
+    """Teams whose actors and targets do not move in this update."""
+    one_by_one: bool = True
+    """How a group is computed: agent after agent, or all in one batch."""
+
+    @property
+    def teams(self):
+        """AlgoConfig of each team."""
+        return load(self.algo, self.adversary)
+
+    def spec(self) -> Spec:
+        if self.env == "interleaved":
+            return interleaved(self.algorithms(("agents",))["agents"])
+        env = make(self.env, **self.options)
+        for team in dict.fromkeys(env.teams):
+            if self.teams[team].joint:
+                env = JointTeam(env, team)
+        return Spec.of(env, self.algorithms(env.teams))
+
+    def algorithms(self, teams):
+        small = {"hidden": (6,), **self.changes}
+        return {team: dataclasses.replace(self.teams[team].algorithm(), **small) for team in teams}
+
+    def hyper(self, spec):
+        """Per group; the numbers differ from each other and between groups, so that none can stand in for another."""
+        base = [self.teams[spec.teams[group.members[0]]].hyper_params() for group in spec.groups]
+        return [
+            h._replace(
+                actor_lr=h.actor_lr * (1 + g),
+                critic_lr=h.critic_lr * (0.7 + g),
+                gamma=h.gamma - 0.1 * g,
+                tau=0.2 + 0.1 * g,  # large, so that the order of agents shows
+                target_noise=0.9 + 0.1 * g,  # often clipped, and often out of a Box
+                target_noise_clip=0.95 - 0.05 * g,
+                logit_regulariser=0.02 * (1 + g),
+                max_grad_norm=0.15 + 0.05 * g,  # some variables are clipped and some are not
+            )
+            for g, h in enumerate(base)
+        ]
+
+
+@functools.cache
+def load(algo, adversary):
+    return config.load([f"algo={algo}", *([f"adversary={adversary}"] if adversary else [])]).teams()
+
+
+def interleaved(algorithm) -> Spec:
+    """Agents of two kinds in the order A, B, A, C, B: groups that are no neighbours."""
+    one, two = Simplex((3,)), Box(2, -1.0, 3.0)
+    return Spec(
+        agents=("a0", "b0", "a1", "c0", "b1"),
+        teams=("agents",) * 5,
+        observation_sizes=(4, 3, 4, 4, 3),
+        action_spaces=(one, two, one, Simplex((2, 2)), two),
+        algorithms=(algorithm,) * 5,
+    )
+
+
+CASES = {
+    # The six of the family, each as its configuration file says.
+    "matd3": Case("simple_spread", "matd3", changes={"hidden": (6, 5)}),
+    "maddpg": Case("simple_speaker_listener", "maddpg"),
+    "iltd3": Case("simple_crypto", "iltd3", still=("adversaries",)),
+    "iddpg": Case("simple_push", "iddpg", shared=True),
+    "td3": Case("simple_spread", "td3"),
+    "ddpg": Case("simple_speaker_listener", "ddpg"),
+    # Teams of different algorithms.
+    "matd3-maddpg": Case("simple_tag", "matd3", "maddpg", still=("agents",)),
+    "matd3-iltd3": Case("simple_adversary", "matd3", "iltd3", sequential=True),
+    "td3-maddpg": Case("simple_adversary", "td3", "maddpg"),
+    # Schedules, minibatches, and groups computed in one batch.
+    "matd3-iddpg-batched": Case("simple_tag", "iddpg", "matd3", one_by_one=False, shared=True),
+    "matd3-still": Case("simple_spread", "matd3", shared=True, still=("agents",), one_by_one=False),
+    "matd3-shared-sequential": Case("simple_spread", "matd3", shared=True, sequential=True),
+    "interleaved": Case("interleaved", "matd3", sequential=True, changes={"smoothing": True}),
+    "interleaved-shared": Case("interleaved", "matd3", shared=True, one_by_one=False, changes={"smoothing": True}),
+    # Action spaces, numbers of critics, clipping, Adam.
+    "box": Case(
+        "point_reach", "matd3", changes={"smoothing": True, "num_critics": 3, "clip": "network", "hidden": (6, 4)}
+    ),
+    "box-own": Case("point_reach", "iltd3", changes={"smoothing": True, "adam": "epsilon_hat"}),
+    "discrete": Case(
+        "simple_spread", "maddpg", options={"actions": "discrete"}, changes={"clip": "none", "adam": "epsilon_hat"}
+    ),
+    "multi-discrete": Case(
+        "simple_crypto", "td3", "matd3", options={"actions": "discrete"}, changes={"clip": "network"}
+    ),
+}
+
+
+def random_state(spec, rng):
+    """Groups whose every number is random: biases, moments, and targets that differ from the online networks."""
+    shapes = jax.eval_shape(lambda key: learner.init(spec, key), jax.random.key(0))
+
+    def fill(path, leaf):
+        name = jax.tree_util.keystr(path)
+        if name.endswith(".count"):
+            return np.full(leaf.shape, 3, leaf.dtype)
+        if ".nu" in name:
+            return np.exp(rng.uniform(np.log(1e-13), np.log(1e-3), leaf.shape))  # down to where epsilon matters
+        scale = 0.01 if ".mu" in name else 0.3 if "bias" in name else 1 / np.sqrt(leaf.shape[-2])
+        return rng.normal(0, scale, leaf.shape)
+
+    return jax.tree_util.tree_map_with_path(fill, shapes)
+
+
+def random_rows(spec, rng, batches, batch=BATCH):
+    """Replay rows [batches, batch, row_size]; every other transition terminates."""
+    rows = rng.normal(size=(batches, batch, spec.row_size))
+    rows[..., -1] = np.arange(batch) % 2
+    return rows
+
+
+def layers(params, *place):
+    """[(kernel, bias)] of the network at `place` of a stack."""
+    pairs = [(params[f"kernel_{n}"], params[f"bias_{n}"]) for n in range(len(params) // 2)]
+    return [(np.array(kernel[place]), np.array(bias[place])) for kernel, bias in pairs]
+
+
+def adam(state: optax.ScaleByAdamState, member, *critic):
+    place = (member, *critic)
+    return reference.Adam(layers(state.mu, *place), layers(state.nu, *place), int(state.count[member]))
+
+
+def agents_of(spec, state, hyper):
+    """The reference's agents, in the order of `spec.agents`, of the states of all groups."""
+    agents = {}
+    for group, s, h in zip(spec.groups, state, hyper, strict=True):
+        for k, i in enumerate(group.members):
+            critics = range(group.algorithm.num_critics)
+            agents[i] = reference.Agent(
+                space=spec.action_spaces[i],
+                observation_size=spec.observation_sizes[i],
+                algorithm=spec.algorithms[i],
+                hyper=h,
+                actor=layers(s.actor, k),
+                actor_target=layers(s.actor_target, k),
+                critics=[layers(s.critic, k, c) for c in critics],
+                critic_targets=[layers(s.critic_target, k, c) for c in critics],
+                actor_adam=adam(s.actor_optimiser, k),
+                critic_adams=[adam(s.critic_optimiser, k, c) for c in critics],
+            )
+    return [agents[i] for i in range(spec.num_agents)]
+
+
+def numbers(agent, names=("actor", "actor_target", "critics", "critic_targets", "actor_adam", "critic_adams")):
+    """All arrays of an agent as {path: array}."""
+    tree = {name: getattr(agent, name) for name in names}
+    for name in ("actor_adam", "critic_adams"):
+        if name in tree:
+            tree[name] = jax.tree.map(dataclasses.asdict, tree[name], is_leaf=lambda a: isinstance(a, reference.Adam))
+    return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}

@@ -1,0 +1,239 @@
+"""One update of the paper in NumPy float64 with hand-written gradients: what `learner.update` is tested against.
+
+Written from the paper and the description of the authors' program, agent after agent and critic after critic; it knows
+nothing of jax, of groups or of stacked networks. Arrays are [batch, size]; a network is a list of (kernel, bias).
+"""
+
+import copy
+import dataclasses
+
+import numpy as np
+
+# ---- networks --------------------------------------------------------------------------------------------------------
+
+
+def forward(layers, x):
+    """Output of a ReLU perceptron with linear output, and what each layer read."""
+    read = []
+    for n, (kernel, bias) in enumerate(layers):
+        read.append(x)
+        x = x @ kernel + bias
+        if n < len(layers) - 1:
+            x = np.maximum(x, 0)
+    return x, read
+
+
+def backward(layers, read, slope):
+    """Gradients [(kernel, bias)] and the gradient of the input, for the gradient `slope` of the output."""
+    gradients = []
+    for n in reversed(range(len(layers))):
+        gradients.insert(0, (read[n].T @ slope, slope.sum(axis=0)))
+        slope = slope @ layers[n][0].T
+        if n:
+            slope = slope * (read[n] > 0)  # what layer n read is the ReLU of layer n - 1
+    return gradients, slope
+
+
+# ---- actions ---------------------------------------------------------------------------------------------------------
+
+
+def is_box(space):
+    return type(space).__name__ == "Box"
+
+
+def choices(space):
+    """Slices of the single choices in an action vector."""
+    ends = np.cumsum(space.sizes)
+    return [slice(end - size, end) for end, size in zip(ends, space.sizes, strict=True)]
+
+
+def softmax(logits):
+    weight = np.exp(logits - logits.max(axis=1, keepdims=True))
+    return weight / weight.sum(axis=1, keepdims=True)
+
+
+def act(space, output, gumbel):
+    """(action, what `act_slope` needs): a Gumbel-softmax sample, its one-hot for hard choices, or a scaled sigmoid."""
+    if is_box(space):
+        sigmoid = 1 / (1 + np.exp(-output))
+        return space.low + (space.high - space.low) * sigmoid, sigmoid
+    soft = np.concatenate([softmax((output + gumbel)[:, part]) for part in choices(space)], axis=1)
+    if type(space).__name__ == "Simplex":
+        return soft, soft
+    hard = np.zeros_like(soft)
+    for part in choices(space):
+        hard[np.arange(len(soft)), part.start + soft[:, part].argmax(axis=1)] = 1
+    return hard, soft
+
+
+def act_slope(space, kept, slope):
+    """Gradient of the actor's output for the gradient `slope` of the action (hard choices: straight through)."""
+    if is_box(space):
+        return slope * (space.high - space.low) * kept * (1 - kept)
+    out = np.zeros_like(slope)
+    for part in choices(space):
+        s, d = kept[:, part], slope[:, part]
+        out[:, part] = s * (d - (s * d).sum(axis=1, keepdims=True))
+    return out
+
+
+def smooth(space, action, normal, sigma, bound):
+    """Target policy smoothing: clipped noise, in half ranges and back into the bounds for a Box."""
+    epsilon = np.clip(sigma * normal, -bound, bound)
+    if is_box(space):
+        return np.clip(action + epsilon * (space.high - space.low) / 2, space.low, space.high)
+    return action + epsilon
+
+
+# ---- optimiser -------------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass
+class Adam:
+    """Moments [(kernel, bias)] and number of steps taken."""
+
+    first: list
+    second: list
+    count: int
+
+
+def clip(gradients, mode, bound):
+    """(gradients within the norm, number of the norms that were too large)."""
+    flat = [g for pair in gradients for g in pair]
+    if mode == "none":
+        return gradients, 0
+    norms = [np.sqrt((g**2).sum()) for g in flat]
+    if mode == "network":
+        norms = [np.sqrt(sum(norm**2 for norm in norms))] * len(flat)
+    scaled = [g * (bound / norm if norm > bound else 1) for g, norm in zip(flat, norms, strict=True)]
+    return list(zip(scaled[::2], scaled[1::2], strict=True)), sum(norm > bound for norm in norms)
+
+
+def adam_step(layers, state, gradients, lr, kind):
+    """(layers, state) after one step of Adam; "epsilon_hat" is TensorFlow 1's."""
+    t = state.count + 1
+
+    def moment(old, rate, power):
+        return [
+            tuple(rate * o + (1 - rate) * g**power for o, g in zip(*pairs, strict=True))
+            for pairs in zip(old, gradients, strict=True)
+        ]
+
+    state = Adam(moment(state.first, 0.9, 1), moment(state.second, 0.999, 2), t)
+
+    def moved(p, m, v):
+        if kind == "epsilon_hat":
+            return p - lr * np.sqrt(1 - 0.999**t) / (1 - 0.9**t) * m / (np.sqrt(v) + 1e-8)
+        return p - lr * (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + 1e-8)
+
+    new = [
+        tuple(moved(p, m, v) for p, m, v in zip(*triple, strict=True))
+        for triple in zip(layers, state.first, state.second, strict=True)
+    ]
+    return new, state
+
+
+def towards(target, online, tau):
+    """Polyak: the target a share `tau` nearer to the online network."""
+    return [
+        tuple(tau * o + (1 - tau) * t for t, o in zip(*pairs, strict=True))
+        for pairs in zip(target, online, strict=True)
+    ]
+
+
+# ---- one update ------------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass
+class Agent:
+    """One agent; `algorithm` and `hyper` are read as plain data with the names of the paper's settings."""
+
+    space: object
+    observation_size: int
+    algorithm: object
+    hyper: object
+    actor: list
+    actor_target: list
+    critics: list
+    critic_targets: list
+    actor_adam: Adam
+    critic_adams: list
+
+
+def take_apart(rows, agents):
+    """Replay rows as (observations, actions, rewards, next observations, discount); lists over the agents."""
+    sizes = [agent.observation_size for agent in agents]
+    widths = [agent.space.size for agent in agents]
+    cuts = np.cumsum([*sizes, *widths, *[1] * len(agents), *sizes])
+    parts = np.split(rows, cuts, axis=1)
+    n = len(agents)
+    return parts[:n], parts[n : 2 * n], [r[:, 0] for r in parts[2 * n : 3 * n]], parts[3 * n : 4 * n], parts[-1][:, 0]
+
+
+def update(agents, batches, gumbel, normal, move, sequential):
+    """One update. Returns (agents after it, metrics [3, agents], number of clipped norms).
+
+    Args:
+        batches: replay rows [batch, row] for each agent.
+        gumbel, normal: functions of an action size: the noise [batch, size] of every sample, and of the smoothing.
+        move: for each agent whether its actor and targets move.
+        sequential: agents see the moved target actors of those before them.
+    """
+    before, agents = agents, copy.deepcopy(agents)
+    metrics, clipped = np.full((3, len(agents)), np.nan), 0
+    for i, agent in enumerate(agents):
+        h, algorithm = agent.hyper, agent.algorithm
+        x, a, r, next_x, discount = take_apart(batches[i], agents)
+        batch, central = len(batches[i]), algorithm.critic == "central"
+
+        # Target: r + gamma min_j Q'_j(x', mu'(o')), bootstrapping unless terminated.
+        next_a = []
+        for j, other in enumerate(agents if sequential else before):
+            action = act(other.space, forward(other.actor_target, next_x[j])[0], gumbel(other.space.size))[0]
+            if algorithm.smoothing:
+                noise = normal(other.space.size)
+                action = smooth(other.space, action, noise, h.target_noise, h.target_noise_clip)
+            next_a.append(action)
+        read = np.concatenate([*next_x, *next_a] if central else [next_x[i], next_a[i]], axis=1)
+        values = [forward(target, read)[0][:, 0] for target in agent.critic_targets]
+        y = r[i] + h.gamma * discount * np.min(values, axis=0)
+
+        # Critics: mean squared error, each with its own optimiser.
+        read = np.concatenate([*x, *a] if central else [x[i], a[i]], axis=1)
+        losses = []
+        for c in range(algorithm.num_critics):
+            q, kept = forward(agent.critics[c], read)
+            error = q[:, 0] - y
+            losses.append((error**2).mean())
+            gradients, _ = backward(agent.critics[c], kept, 2 * error[:, None] / batch)
+            gradients, count = clip(gradients, algorithm.clip, h.max_grad_norm)
+            clipped += count
+            if c == 0:
+                metrics[1, i] = q.mean()
+            agent.critics[c], agent.critic_adams[c] = adam_step(
+                agent.critics[c], agent.critic_adams[c], gradients, h.critic_lr, algorithm.adam
+            )
+        metrics[0, i] = np.mean(losses)
+        if not move[i]:
+            continue
+
+        # Actor: climbs the first critic (as it now is) with its own action drawn anew and the others' as replayed.
+        output, kept = forward(agent.actor, x[i])
+        own, kept_act = act(agent.space, output, gumbel(agent.space.size))
+        mixed = [own if j == i else a[j] for j in range(len(agents))]
+        q, kept_q = forward(agent.critics[0], np.concatenate([*x, *mixed] if central else [x[i], own], axis=1))
+        metrics[2, i] = -q.mean() + h.logit_regulariser * (output**2).mean()
+        _, slope = backward(agent.critics[0], kept_q, np.full((batch, 1), -1 / batch))
+        start = sum(o.shape[1] for o in x) + sum(o.shape[1] for o in a[:i]) if central else x[i].shape[1]
+        slope = act_slope(agent.space, kept_act, slope[:, start : start + agent.space.size])
+        slope = slope + h.logit_regulariser * 2 * output / output.size
+        gradients, _ = backward(agent.actor, kept, slope)
+        gradients, count = clip(gradients, algorithm.clip, h.max_grad_norm)
+        clipped += count
+        agent.actor, agent.actor_adam = adam_step(agent.actor, agent.actor_adam, gradients, h.actor_lr, algorithm.adam)
+
+        agent.actor_target = towards(agent.actor_target, agent.actor, h.tau)
+        agent.critic_targets = [
+            towards(target, online, h.tau) for target, online in zip(agent.critic_targets, agent.critics, strict=True)
+        ]
+    return agents, metrics, clipped

@@ -1,0 +1,290 @@
+"""One update against the float64 reference, for every algorithm of the family, and what must not depend on what."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from learner_cases import BATCH, CASES, agents_of, numbers, random_rows, random_state
+
+from matd3_jax import learner, networks
+
+TOLERANCE = 1e-10
+"""Absolute and relative, both sides in float64: sums of some hundred terms round at about 1e-14, Adam's division by
+roots of second moments as small as 1e-13 (weights move 0.01 m / sqrt(v)) enlarges that some hundred times. The smallest
+effect meant to be seen, Adam's epsilon in the other place, is above 1e-7 (`test_reference_tells_apart`)."""
+
+pytestmark = pytest.mark.usefixtures("quick_jit")
+
+
+def noise_table(kind, size, batch=BATCH):
+    """The noise [batch, size] that stands in for every draw of that kind and size: the same for all agents, so that
+    keys and the order of draws do not matter here (`test_draws_have_their_own_keys` looks at those)."""
+    rng = np.random.default_rng([size, kind == "normal"])
+    return rng.gumbel(size=(batch, size)) if kind == "gumbel" else rng.normal(size=(batch, size))
+
+
+class Program:
+    """The compiled update of a case in float64, with known noise; call it with (state, rows)."""
+
+    def __init__(self, case):
+        self.case, self.spec = case, case.spec()
+        self.hyper = case.hyper(self.spec)
+        self.move = [self.spec.teams[group.members[0]] not in case.still for group in self.spec.groups]
+        self.batches = 1 if case.shared else self.spec.num_agents
+
+        def update(state, rows):
+            key, options = jax.random.key(0), {"sequential": case.sequential, "one_by_one": case.one_by_one}
+            return learner.update(self.spec, state, self.hyper, rows, key, self.move, **options)
+
+        self.jitted = jax.jit(update)
+
+    def __call__(self, state, rows, known_noise=True):
+        """Who samples or smooths gets the table's noise; whether there is noise at all stays the learner's choice."""
+
+        def act(space, output, draw, *scale):
+            return real_act(space, output, None if draw is None else noise_table("gumbel", space.size), *scale)
+
+        def smooth(space, action, draw, *options):
+            return real_smooth(space, action, noise_table("normal", space.size), *options)
+
+        real_act, real_smooth = networks.act, networks.smooth
+        with jax.enable_x64(True), pytest.MonkeyPatch.context() as patch:
+            if known_noise:
+                patch.setattr(networks, "act", act)
+                patch.setattr(networks, "smooth", smooth)
+            return jax.tree.map(np.asarray, self.jitted(state, rows))
+
+    def inputs(self, seed=0):
+        rng = np.random.default_rng(seed)
+        with jax.enable_x64(True):
+            return random_state(self.spec, rng), random_rows(self.spec, rng, self.batches)
+
+    def reference(self, state, rows, sequential=None, alter=lambda agent: None):
+        agents = agents_of(self.spec, state, self.hyper)
+        for agent in agents:
+            alter(agent)
+        return reference.update(
+            agents,
+            [rows[0 if self.case.shared else i] for i in range(len(agents))],
+            gumbel=functools.partial(noise_table, "gumbel"),
+            normal=functools.partial(noise_table, "normal"),
+            move=[self.spec.teams[i] not in self.case.still for i in range(len(agents))],
+            sequential=self.case.sequential if sequential is None else sequential,
+        )
+
+    def agents(self, state):
+        return agents_of(self.spec, state, self.hyper)
+
+
+@functools.cache
+def program(name):
+    return Program(CASES[name])
+
+
+@functools.cache
+def base(name):
+    """(program, state, rows, state and metrics after the update) of a case."""
+    p = program(name)
+    state, rows = p.inputs()
+    return p, state, rows, *p(state, rows)
+
+
+def differing(before, after, **kwargs):
+    """Paths of the arrays that are not bit for bit the same in two agents."""
+    before, after = numbers(before, **kwargs), numbers(after, **kwargs)
+    assert before.keys() == after.keys()
+    return {path for path in before if not np.array_equal(before[path], after[path])}
+
+
+# ---- against the reference -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_update_equals_reference(name):
+    """All parameters, targets, moments and losses after one update: the whole algorithm, gradients included."""
+    p, state, rows, new, metrics = base(name)
+    expected, losses, clipped = p.reference(state, rows)
+    for i, (agent, other) in enumerate(zip(p.agents(new), expected, strict=True)):
+        got, want = numbers(agent), numbers(other)
+        assert got.keys() == want.keys()
+        for path in want:
+            assert np.shape(got[path]) == np.shape(want[path])
+            np.testing.assert_allclose(
+                got[path], want[path], rtol=TOLERANCE, atol=TOLERANCE, err_msg=f"{name}, {p.spec.agents[i]}: {path}"
+            )
+    np.testing.assert_allclose(np.stack(metrics), losses, rtol=TOLERANCE, atol=TOLERANCE)
+    assert (clipped > 0) == (p.spec.algorithms[0].clip != "none")
+
+
+def test_some_norms_are_clipped_and_some_are_not():
+    """The comparison covers both sides of the clipping: 3 agents with 3 networks of 3 layers have 54 variables."""
+    p, state, rows, _, _ = base("matd3")
+    assert 5 < p.reference(state, rows)[2] < 49
+
+
+@pytest.mark.parametrize(
+    "name, field, value",
+    [
+        ("matd3", "algorithm.clip", "network"),
+        ("matd3", "algorithm.adam", "epsilon_hat"),
+        ("matd3", "algorithm.critic", "own"),
+        ("box", "algorithm.smoothing", False),
+        ("box", "hyper.target_noise_clip", 9.0),
+        ("matd3", "hyper.logit_regulariser", 0.0),
+        ("matd3", "sequential", True),
+        ("matd3-shared-sequential", "sequential", False),
+        ("interleaved", "sequential", False),
+    ],
+)
+def test_reference_tells_apart(name, field, value):
+    """What the cases vary is seen by the comparison: with one setting changed the reference is elsewhere, by far more
+    than the tolerance."""
+    p, state, rows, _, _ = base(name)
+
+    def alter(agent):
+        part, _, key = field.partition(".")
+        if part == "algorithm":
+            agent.algorithm = dataclasses.replace(agent.algorithm, **{key: value})
+        elif part == "hyper":
+            agent.hyper = agent.hyper._replace(**{key: value})
+
+    right, _, _ = p.reference(state, rows)
+    if field == "algorithm.critic":
+        # The critics' inputs would not fit: only check that the central critic does read the others' parts.
+        rows = rows.copy()
+        rows[..., p.spec.observation_sizes[0]] += 1
+        wrong, _, _ = p.reference(state, rows)
+    else:
+        sequential = value if field == "sequential" else None
+        wrong, _, _ = p.reference(state, rows, sequential=sequential, alter=alter)
+    gaps = [
+        np.abs(np.asarray(a) - b).max()
+        for one, other in zip(map(numbers, right), map(numbers, wrong), strict=True)
+        for a, b in zip(one.values(), other.values(), strict=True)
+    ]
+    assert max(gaps) > 100 * TOLERANCE
+
+
+# ---- what must not depend on what ------------------------------------------------------------------------------------
+
+
+def test_own_critic_reads_nothing_of_others():
+    """Independent learners: whatever the others saw, did, got and will see, and whatever their networks are, the
+    agent's update is the same bit for bit. (IL that peeks through the target or the actor loss is not IL.)"""
+    p, state, rows, new, _ = base("iltd3")
+    spec, agent = p.spec, 2
+    own = np.zeros(spec.row_size, bool)
+    own[-1] = True
+    x, a = spec.observation_starts[agent], spec.action_starts[agent]
+    own[x : x + spec.observation_sizes[agent]] = True
+    own[spec.observation_size + a :][: spec.action_spaces[agent].size] = True
+    own[spec.observation_size + spec.action_size + agent] = True
+    own[-1 - spec.observation_size + x :][: spec.observation_sizes[agent]] = True
+    other_rows = np.where(own, rows, rows + 1)
+    k = spec.groups[-1].members.index(agent)
+    other_state = jax.tree.map(lambda leaf: leaf + leaf.dtype.type(1), state)
+    last = jax.tree.map(
+        lambda old, moved: np.concatenate([moved[:k], old[k : k + 1], moved[k + 1 :]]), state[-1], other_state[-1]
+    )
+    after, _ = p((*other_state[:-1], last), other_rows)
+    assert not differing(p.agents(new)[agent], p.agents(after)[agent])
+    assert differing(p.agents(new)[1], p.agents(after)[1])
+
+
+def test_minibatch_of_a_member_is_its_own():
+    """Independent minibatches: another minibatch for agent 1 changes agent 1 only, and all that it learns."""
+    p, state, rows, new, _ = base("matd3")
+    rows = rows.copy()
+    rows[1] += 0.1
+    after, _ = p(state, rows)
+    changed = [differing(a, b) for a, b in zip(p.agents(new), p.agents(after), strict=True)]
+    assert not changed[0] and not changed[2]
+    assert {path.split("[")[1] for path in changed[1]} == {
+        f"'{name}']" for name in ("actor", "actor_target", "critics", "critic_targets", "actor_adam", "critic_adams")
+    }
+
+
+def test_others_actions_are_constants():
+    """The online actors of the others matter to nothing of an agent: in its actor loss their actions come from the
+    replay, in its target from the target actors. Nor does its own actor get a gradient of their losses."""
+    p, state, rows, new, _ = base("matd3")
+
+    def shake(s, field):
+        """The state with other numbers in `field` of agent 1."""
+        part = jax.tree.map(lambda leaf: np.concatenate([leaf[:1], leaf[1:2] + 0.1, leaf[2:]]), getattr(s, field))
+        return s._replace(**{field: part})
+
+    for field, reach in {"actor": {1}, "critic": {1}, "critic_target": {1}, "actor_target": {0, 1, 2}}.items():
+        after, _ = p((shake(state[0], field),), rows)
+        changed = {i for i, (a, b) in enumerate(zip(p.agents(new), p.agents(after), strict=True)) if differing(a, b)}
+        assert changed == reach, field
+
+
+def test_nothing_moves_when_still():
+    """An update between two policy updates leaves actor, its optimiser and all targets as they are, bit for bit."""
+    p, state, _, new, metrics = base("matd3-still")
+    for before, after in zip(p.agents(state), p.agents(new), strict=True):
+        assert not differing(before, after, names=("actor", "actor_target", "critic_targets", "actor_adam"))
+        assert differing(before, after, names=("critics", "critic_adams"))
+    assert np.isnan(metrics.actor_loss).all() and np.isfinite(metrics.critic_loss).all()
+
+
+def test_terminated_rows_have_no_future():
+    """With discount 0 in all rows, x' and all targets are nothing to the update's critics."""
+    p, state, rows, _, _ = base("matd3")
+    ended = rows.copy()
+    ended[..., -1] = 0
+    first, _ = p(state, ended)
+    ended[..., -1 - p.spec.observation_size : -1] += 1
+    second, _ = p(state, ended)
+    for one, other in zip(p.agents(first), p.agents(second), strict=True):
+        assert not differing(one, other)
+
+
+# ---- noise -----------------------------------------------------------------------------------------------------------
+
+
+def test_twin_critics_see_the_same_action():
+    """With real noise, critics of an agent that start alike stay alike: both are trained on one target, made of one
+    sample of the joint action and of one smoothing of it."""
+    p = Program(dataclasses.replace(CASES["matd3"], changes={"smoothing": True}))
+    state, rows = p.inputs()
+
+    def alike(s):
+        critics = {name: getattr(s, name) for name in ("critic", "critic_target", "critic_optimiser")}
+        same = jax.tree.map(lambda leaf: np.repeat(leaf[:, :1], 2, 1) if leaf.ndim > 1 else leaf, critics)
+        return s._replace(**same)
+
+    new, _ = p(tuple(map(alike, state)), rows, known_noise=False)
+    for s in new:
+        for leaf in jax.tree.leaves((s.critic, s.critic_target)):
+            np.testing.assert_array_equal(leaf[:, 0], leaf[:, 1])
+
+
+def test_draws_have_their_own_keys(monkeypatch):
+    """No key is drawn from twice in an update: the target's samples, the smoothing and the actor's own fresh action are
+    independent of each other and from group to group."""
+    p, keys = Program(CASES["interleaved"]), []
+
+    def draw(key, shape=(), *args, **kwargs):
+        keys.append(jax.random.key_data(key))
+        return jnp.zeros(shape)
+
+    monkeypatch.setattr(jax.random, "gumbel", draw)
+    monkeypatch.setattr(jax.random, "normal", draw)
+
+    def update(state, rows):
+        keys.clear()
+        learner.update(p.spec, state, p.hyper, rows, jax.random.key(1), p.move, sequential=True)
+        return jnp.stack(keys)
+
+    p.jitted = jax.jit(update)
+    drawn = p(*p.inputs(), known_noise=False)
+    assert len(np.unique(drawn, axis=0)) == len(drawn)
+    # Three groups of central critics, two of them of choices: each has 2 samples and 3 smoothings of targets, and the
+    # two an own action.
+    assert len(drawn) >= 3 * (2 + 3) + 2

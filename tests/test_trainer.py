@@ -1,0 +1,299 @@
+"""The loop: what is stored, when updates come and what they move, and that seeds, devices and chunks do not matter."""
+
+import dataclasses
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from ledger import ENDS, HYPER, LIMIT, Ledger, by_hand
+
+from matd3_jax import learner, rollout
+from matd3_jax.algorithms import Algorithm
+from matd3_jax.spec import Spec
+from matd3_jax.trainer import Schedule, Trainer
+
+MATD3 = Algorithm(hidden=(4,))
+MADDPG = Algorithm(name="maddpg", hidden=(4,), num_critics=1, policy_delay=1)
+SCHEDULE = Schedule(num_envs=3, rollout_length=4, batch_size=8, replay_capacity=60, learning_starts=36)
+SEEDS = 3
+
+pytestmark = pytest.mark.usefixtures("quick_jit")
+
+
+def make(seeds, schedule=SCHEDULE, delays=(2, 1), env=None, tau=0.1, **options):
+    """A trainer of Ledger with one team an agent: MATD3-like for the first, MADDPG-like for the others."""
+    env = env or Ledger()
+    algorithms = {
+        team: dataclasses.replace(MADDPG if i else MATD3, policy_delay=delay)
+        for i, (team, delay) in enumerate(zip(env.teams, delays, strict=True))
+    }
+    # A learning rate for each seed: seeds must not mix up their hyper-parameters.
+    rates = np.array([0.01, 0.02, 0.03])[seeds]
+    hyper = {team: HYPER._replace(critic_lr=rates, tau=tau) for team in env.teams}
+    return Trainer(env, Spec.of(env, algorithms), schedule, hyper, len(seeds), **options)
+
+
+def start(trainer, seeds):
+    return trainer.prefill(trainer.init(jax.vmap(jax.random.key)(jnp.asarray(seeds))))
+
+
+def plain(tree):
+    """A pytree in NumPy, keys as numbers."""
+
+    def one(leaf):
+        return np.asarray(jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf)
+
+    return jax.tree.map(one, tree)
+
+
+def back(state, seeds):
+    """Some seeds of what `plain` made of a state, ready to be trained on."""
+    key, collects = jax.random.wrap_key_data(state.key[seeds]), jnp.int32(state.collects)
+    some = jax.tree.map(lambda leaf: jnp.asarray(leaf[seeds]), state._replace(key=(), collects=()))
+    return some._replace(key=key, collects=collects)
+
+
+@functools.cache
+def main_run():
+    """Three seeds on all devices, tau = 1: states after the prefill and after one, two and three cycles, metrics."""
+    trainer = make([0, 1, 2], tau=1.0)
+    state, episodes = start(trainer, [0, 1, 2])
+    states, metrics, chunk = [plain(state)], [], trainer.chunk(1)
+    for _ in range(3):
+        state, m = chunk(state)
+        states.append(plain(state))
+        metrics.append(plain(m))
+    return trainer, states, plain(episodes), metrics
+
+
+# ---- what is stored --------------------------------------------------------------------------------------------------
+
+
+def transitions(seed):
+    """Rows of a seed in the order of play, [collects * rollout_length, num_envs, row] of all that were collected."""
+    _, states, _, _ = main_run()
+    collects = []
+    for before, after in itertools.pairwise(states):
+        for c in range(int(before.collects), int(after.collects)):
+            at = c * SCHEDULE.collect_steps % SCHEDULE.replay_capacity
+            collects.append(after.replay[seed, at : at + SCHEDULE.collect_steps])
+    first = states[0]
+    rows = first.replay[seed, : int(first.collects) * SCHEDULE.collect_steps]
+    return np.concatenate([rows, *collects]).reshape(-1, SCHEDULE.num_envs, rows.shape[-1])
+
+
+@pytest.mark.parametrize("seed", range(SEEDS))
+def test_transitions_are_exact(seed):
+    """Each stored transition is what the environment does with the stored action: reward, the TRUE final observation
+    as x' at an episode's end, discount 0 only where it terminated. Play goes on from x', or from a fresh episode."""
+    rows = transitions(seed)
+    assert rows.shape == (8 * 4, 3, 7 + 4 + 2 + 7 + 1)  # two collects of prefill, three cycles of two each
+    ends = {"terminated": 0, "truncated": 0}
+    numbers = set()
+    for e in range(SCHEDULE.num_envs):
+        fresh, went_on = True, None
+        for row in rows[:, e]:
+            x, action, reward, next_x, discount = np.split(row, [7, 11, 13, 20])
+            if fresh:
+                assert x[1] == 0 and not x[[2, 5]].any()
+                assert x[0] not in numbers
+                numbers.add(x[0])
+            else:
+                np.testing.assert_array_equal(x, went_on)
+            np.testing.assert_allclose(action.reshape(2, 2).sum(axis=1), 1, atol=1e-6)  # float32 softmax
+            want_reward, want_x, terminated, truncated = by_hand(x, action)
+            np.testing.assert_allclose(reward, want_reward, rtol=1e-6)  # float32, one addition
+            np.testing.assert_allclose(next_x, want_x, rtol=1e-6)
+            assert discount == (0 if terminated else 1)
+            ends["terminated"] += terminated
+            ends["truncated"] += truncated
+            fresh, went_on = terminated or truncated, next_x
+    assert min(ends.values()) >= 3
+    assert len(np.unique(rows[..., 7])) == rows[..., 7].size, "every action has noise of its own"
+
+
+def test_episode_sums():
+    """Count, length and undiscounted return of the episodes that ended, from the stored rewards by hand."""
+    _, states, prefill, metrics = main_run()
+    for seed in range(SEEDS):
+        count, length, returns = 0, 0, np.zeros(2)
+        for e in range(SCHEDULE.num_envs):
+            running = np.zeros(2)
+            for row in transitions(seed)[:, e]:
+                running += row[11:13]
+                if row[14] == LIMIT or row[14] == ENDS and row[13] < 0.5:
+                    count, length, returns = count + 1, length + row[14], returns + running
+                    running = np.zeros(2)
+        parts = [prefill, *(m.episodes for m in metrics)]
+        total = jax.tree.map(lambda *e, s=seed: sum(x[s].sum(axis=0) for x in e), *parts)
+        assert (total.count, total.length) == (count, length)
+        np.testing.assert_allclose(total.episode_return, returns, rtol=1e-5)  # float32 sums of a hundred rewards
+
+
+# ---- when updates come -----------------------------------------------------------------------------------------------
+
+
+def test_counts_of_the_real_learner():
+    """No update before `learning_starts` transitions, then one for each collect; MATD3 (d = 2) moves actor and targets
+    with every second, MADDPG with each; with tau = 1 the targets equal the online networks right after they moved, as
+    the last update of a cycle must move them."""
+    trainer, states, _, metrics = main_run()
+    assert trainer.schedule.prefill_collects == 2 and trainer.cycle_collects == 2
+    for cycles, state in enumerate(states):
+        assert state.collects == 2 + 2 * cycles
+        assert trainer.updates(int(state.collects)) == 2 * cycles
+        written = (state.replay != 0).any(axis=-1).sum(axis=1)
+        assert (written == min(24 + 24 * cycles, 60)).all()
+        for group, delay in zip(state.groups, (2, 1), strict=True):
+            assert (group.critic_optimiser.count == 2 * cycles).all()
+            assert (group.actor_optimiser.count == 2 * cycles // delay).all()
+            for online, target in ((group.actor, group.actor_target), (group.critic, group.critic_target)):
+                # float32: 1 * online + 0 * target, perhaps written target + 1 * (online - target).
+                jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-7), online, target)
+    for before, after in itertools.pairwise(states):
+        for old, new in zip(before.groups, after.groups, strict=True):
+            for name in ("actor", "critic"):
+                kernels = [
+                    np.abs(a - b).max()
+                    for a, b in zip(*map(jax.tree.leaves, (getattr(old, name), getattr(new, name))), strict=True)
+                ]  # noqa: E501
+                assert min(kernels) > 0
+    assert all(np.isfinite(leaf).all() for m in metrics for leaf in jax.tree.leaves(m))
+
+
+def stub(log):
+    """In `learner.update`'s place: writes into the actors a binary number of the moves so far (first bit a 1), and the
+    number of different transitions and of empty rows in the minibatches into the metrics."""
+
+    def update(spec, state, hyper, rows, key, move, *args, **kwargs):
+        log.append(rows.shape)
+        state = tuple(
+            s._replace(actor=jax.tree.map(lambda leaf, m=m: 2 * leaf + m, s.actor))
+            for s, m in zip(state, move, strict=True)
+        )
+        name = jnp.sort((rows[..., 0] + rows[..., 1]).ravel())  # number of the episode + step
+        different, empty = 1.0 + (jnp.diff(name) > 0).sum(), (rows[..., 0] == 0).sum()
+        own = jnp.mean(rows[0] != rows[-1])
+        return state, learner.UpdateMetrics(*(jnp.full(spec.num_agents, v) for v in (different, empty, own)))
+
+    return update
+
+
+def stubbed_run(monkeypatch, trainer, state, cycles):
+    """(moves of each group so far as a string of bits, metrics of each cycle, shapes of the rows)."""
+    log = []
+    monkeypatch.setattr(learner, "update", stub(log))
+    ones = jax.tree.map(lambda leaf: jnp.ones_like(leaf), [g.actor for g in state.groups])
+    state = state._replace(groups=tuple(g._replace(actor=a) for g, a in zip(state.groups, ones, strict=True)))
+    state, metrics = trainer.chunk(cycles)(state)
+    numbers = [np.unique(np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(g.actor)])) for g in state.groups]
+    return [f"{int(n.item()):b}"[1:] for n in numbers], plain(metrics), log
+
+
+def moves(monkeypatch, delays, updates):
+    """(bits of two cycles, expected bits): nothing is played, only the schedule counts."""
+
+    def stay(env, spec, actors, hyper, env_state, key, length, **options):
+        rows = jnp.zeros((length * env_state.episode_step.shape[0], spec.row_size))
+        return env_state, rows, rollout.Episodes(jnp.int32(0), jnp.zeros(spec.num_agents), jnp.int32(0))
+
+    monkeypatch.setattr(rollout, "collect", stay)
+    trainer = make([0], dataclasses.replace(SCHEDULE, updates_per_collect=updates), delays)
+    bits, _, _ = stubbed_run(monkeypatch, trainer, back(main_run()[1][0], slice(0, 1)), cycles=2)
+    total = 2 * trainer.cycle_collects * updates
+    assert total % np.lcm(*delays) == 0
+    return bits, ["".join("1" if u % d == 0 else "0" for u in range(1, total + 1)) for d in delays]
+
+
+@pytest.mark.parametrize(
+    "delays, updates",
+    [((1, 2), 1), ((3, 3), 1), ((2, 3), 1), ((2, 2), 2), ((1, 2), 4), ((3, 1), 6), ((4, 2), 2)],
+)
+def test_moves(monkeypatch, delays, updates):
+    """Actors and targets move with exactly every d-th update of the learner (the d-th first), counted in updates and
+    not in env steps, for teams of different delays and one or many updates a collect."""
+    got, want = moves(monkeypatch, delays, updates)
+    assert got == want
+
+
+@pytest.mark.parametrize("delays, updates", [((2, 2), 3), ((3, 1), 2)])
+def test_moves_where_delay_and_updates_do_not_fit(monkeypatch, delays, updates):
+    """The same where neither of delay and updates_per_collect divides the other; a ValueError would do, too."""
+    try:
+        got, want = moves(monkeypatch, delays, updates)
+    except ValueError as error:
+        assert "policy_delay" in str(error)
+    else:
+        assert got == want
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_minibatches(monkeypatch, shared):
+    """The first update comes with exactly `learning_starts` transitions, which can all be drawn, the newest too; later
+    updates see all that the ring holds; nobody draws an empty row. 4,000 draws miss one of 60 rows once in 10^27."""
+    schedule = dataclasses.replace(SCHEDULE, batch_size=4000, shared_minibatch=shared)
+    trainer = make([0], schedule, delays=(1, 1))
+    _, metrics, log = stubbed_run(monkeypatch, trainer, back(main_run()[1][0], slice(0, 1)), cycles=4)
+    assert {shape[:2] for shape in log} == {(1 if shared else 2, 4000)}
+    np.testing.assert_array_equal(metrics.update.critic_loss[0, :, 0], [36, 48, 60, 60])
+    assert not metrics.update.q_value.any()
+    assert (metrics.update.actor_loss[0] == 0).all() if shared else (metrics.update.actor_loss[0] > 0.3).all()
+
+
+# ---- what does not matter --------------------------------------------------------------------------------------------
+
+
+def same(one, other, seeds_one, seeds_other):
+    """Assert that the seeds of two states are alike in everything but `collects`.
+
+    Tolerance: float32; the same sums in another order or width of vectors, over six updates.
+    """
+    leaves = [jax.tree.leaves(state._replace(collects=())) for state in (one, other)]
+    for a, b in zip(*leaves, strict=True):
+        a, b = a[seeds_one], b[seeds_other]
+        if np.issubdtype(a.dtype, np.floating):
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+        else:
+            np.testing.assert_array_equal(a, b)
+    assert one.collects == other.collects
+
+
+def test_seed_alone():
+    """Seed 1 with its own hyper-parameters by itself gives what it gives among three."""
+    trainer = make([1], tau=1.0)
+    state, _ = start(trainer, [1])
+    state, _ = trainer.chunk(3)(state)
+    same(plain(state), main_run()[1][3], [0], [1])
+    first, second = (jax.tree.leaves(main_run()[1][3].groups[0].critic)[-1][i] for i in (0, 1))
+    assert np.abs(first - second).max() > 1e-3, "the seeds themselves differ"
+
+
+@pytest.mark.skipif(len(jax.devices()) < 2, reason="one device")
+def test_devices_and_pieces_and_chunks():
+    """An odd number of seeds on one device, two at a time, in one long chunk: as on two devices, in three chunks."""
+    several, states, _, metrics = main_run()
+    assert several.mesh.size == 2 and several.rows == 4
+    trainer = make([0, 1, 2], tau=1.0, devices=jax.devices()[:1], piece=3)
+    state, long = trainer.chunk(3)(back(states[0], slice(0, 3)))
+    same(plain(state), states[3], slice(0, 3), slice(0, 3))
+    short = jax.tree.map(lambda *m: np.concatenate(m, axis=1)[:3], *metrics)
+    # float32 as in `same`; returns are sums of some hundred.
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), plain(long), short)
+
+
+def test_evaluate():
+    """Whole episodes, each counted once and to its end: lengths are those of the environment, the returns those of the
+    recorded totals; deterministic play of one policy repeats itself but for the start."""
+    trainer, _, _, _ = main_run()
+    state, _ = start(trainer, [0, 1, 2])
+    keys = jax.vmap(jax.random.key)(jnp.arange(3))
+    returns, lengths = map(np.asarray, trainer.evaluate(state, keys, 40, deterministic=True))
+    assert returns.shape == (3, 40, 2) and lengths.shape == (3, 40)
+    assert set(np.unique(lengths)) == {ENDS, LIMIT}
+    # Reward at step t is total + 10 i; totals grow by the action's first entry, between 0 and 1.
+    most = lengths * (lengths + 1) / 2
+    assert (returns[..., 0] > 0).all() and (returns[..., 0] < most).all()
+    assert (returns[..., 1] > 10 * lengths).all() and (returns[..., 1] < 10 * lengths + most).all()
