@@ -83,7 +83,7 @@ def report(out: Path) -> None:
                 continue
             other = theirs[algo][1][:, list(theirs[algo][0]).index(episode)]
             other, a = other[~np.isnan(other)], mine[:, k]
-            cells = [ALGORITHMS[algo], f"{episode:,}"]
+            cells = [ALGORITHMS[algo], f"{int(episode):,}"]
             cells += [f"{v.mean():.1f} ({v.std(ddof=1):.1f}, {len(v)})" for v in (a, other)]
             lines.append(f"| {' | '.join(cells)} | {a.mean() - other.mean():+.1f} ± {_welch(a, other):.1f} |")
     figure.axes[0].set_ylabel("training return, summed over agents")

@@ -150,8 +150,6 @@ def test_a_missing_checksum_file_is_damage(whole, tmp_path):
 
 
 def test_tensorboard_files_hold_the_table(whole, tmp_path):
-    tensorboardX = pytest.importorskip("tensorboardX", exc_type=ImportError)
-    assert tensorboardX
     assert run(tmp_path, "name=tb", "tensorboard=true") == 0
     events = list((tmp_path / "tb" / "tensorboard").glob("events*"))
     assert len(events) == 1 and b"return_agents/seed_2" in events[0].read_bytes()
