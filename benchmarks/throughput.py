@@ -2,6 +2,8 @@
 
     python -m benchmarks.throughput [env=simple_spread] [seeds=[1,4,20]] [repeats=5] [out=FILE.json] [key=value ...]
 
+To compare machines, the rate of a matrix product of the loop's kind on all devices at once is measured first and last.
+
 Other keys are settings of the run, as `python -m matd3_jax.train` takes them. Every figure counts all seeds together
 and is the median of `repeats` stretches of about a second, with the slowest and the fastest beside it. "update alone"
 gives the env steps/s at which a loop with free rollouts would run.
@@ -16,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from matd3_jax import command, config, devices
@@ -33,8 +36,14 @@ def main(argv: Sequence[str]) -> int:
     counts = options["seeds"] if isinstance(options["seeds"], list) else [options["seeds"]]
     if not all(type(n) is int and n >= 1 for n in counts):
         raise UserError(f"seeds={options['seeds']!r}: must be whole numbers of at least 1, for instance seeds=[1,4,20]")
-    report = {"machine": devices.description(), "versions": devices.versions(), "commit": commit(), "settings": argv}
-    for key in ("machine", "versions", "commit"):
+    report: dict[str, Any] = {
+        "machine": devices.description(),
+        "versions": devices.versions(),
+        "commit": commit(),
+        "settings": argv,
+    }
+    report["gflops_before"] = matmul_gflops()
+    for key in ("machine", "versions", "commit", "gflops_before"):
         print(f"{key}: {report[key]}")
     print(
         f"{'seeds':>5} {'part':<10} {'env steps/s':>12} {'slowest':>10} {'fastest':>10} {'updates/s':>10}", flush=True
@@ -47,6 +56,8 @@ def main(argv: Sequence[str]) -> int:
                   f"{row['fastest']:>10,.0f} {row['updates_per_second']:>10,.1f}"
                   f"   compiled in {row['compile_seconds']:.1f} s", flush=True)  # fmt: skip
     report["rows"] = rows
+    report["gflops_after"] = matmul_gflops()
+    print(f"gflops_after: {report['gflops_after']}")
     if options["out"] is not None:
         Path(options["out"]).write_text(json.dumps(report, indent=1) + "\n")
     return 0
@@ -98,6 +109,25 @@ def measure(overrides: Sequence[str], seeds: int, repeats: int, seconds: float) 
             }
         )
     return rows
+
+
+def matmul_gflops(repeats: int = 7) -> float:
+    """Giga floating point operations a second of [1024, 128] x [128, 128] products on all devices together, median."""
+    count, mesh = 200, jax.make_mesh((jax.device_count(),), ("devices",))
+    spec = jax.sharding.PartitionSpec("devices")
+    x = jnp.ones((jax.device_count(), 1024, 128)) / 128
+
+    def products(x):
+        w = jnp.ones((1, 128, 128)) / 128
+        return jax.lax.fori_loop(0, count, lambda _, y: y @ w, x)
+
+    program = jax.jit(jax.shard_map(products, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
+    times = []
+    for _ in range(repeats + 1):
+        begun = time.perf_counter()
+        jax.block_until_ready(program(x))
+        times.append(time.perf_counter() - begun)
+    return round(2 * jax.device_count() * count * 1024 * 128 * 128 / float(np.median(times[1:])) / 1e9, 1)
 
 
 def _collects(trainer: Trainer, state: TrainState, hyper: Any) -> tuple[TrainState, Any]:

@@ -84,7 +84,7 @@ def collect(
         return carry, (rows, episodes)
 
     step_keys, reset_keys = (jax.random.split(k, (length, num_envs)) for k in (step_key, reset_key))
-    # Every step has a fresh start at hand, drawn in one batch: inside the loop it would be drawn as often, in small ones.
+    # Every step has a fresh start at hand, drawn in one batch: inside the loop they would be as many, drawn one by one.
     fresh = jax.vmap(jax.vmap(env.reset))(reset_keys)
     env_state, (rows, episodes) = jax.lax.scan(step, env_state, (noise, step_keys, fresh))
     return env_state, rows.reshape(length * num_envs, -1), jax.tree.map(lambda e: e.sum(axis=0), episodes)
