@@ -113,7 +113,7 @@ def measure(overrides: Sequence[str], seeds: int, repeats: int, seconds: float) 
 
 def matmul_gflops(repeats: int = 7) -> float:
     """Giga floating point operations a second of [1024, 128] x [128, 128] products on all devices together, median."""
-    count, mesh = 200, jax.make_mesh((jax.device_count(),), ("devices",))
+    count, mesh = 200, jax.sharding.Mesh(np.array(jax.devices()), ("devices",))
     spec = jax.sharding.PartitionSpec("devices")
     x = jnp.ones((jax.device_count(), 1024, 128)) / 128
 
