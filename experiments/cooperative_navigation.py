@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 import matd3_jax
 from matd3_jax import command, config, devices
 from matd3_jax.plotting import curve
+from matd3_jax.statistics import welch_interval
 
 HERE = Path(__file__).parent
 ALGORITHMS = {"matd3": "MATD3", "maddpg": "MADDPG"}
@@ -85,7 +86,7 @@ def report(out: Path) -> None:
             other, a = other[~np.isnan(other)], mine[:, k]
             cells = [ALGORITHMS[algo], f"{int(episode):,}"]
             cells += [f"{v.mean():.1f} ({v.std(ddof=1):.1f}, {len(v)})" for v in (a, other)]
-            lines.append(f"| {' | '.join(cells)} | {a.mean() - other.mean():+.1f} ± {_welch(a, other):.1f} |")
+            lines.append(f"| {' | '.join(cells)} | {a.mean() - other.mean():+.1f} ± {welch_interval(a, other):.1f} |")
     figure.axes[0].set_ylabel("training return, summed over agents")
     figure.savefig(out / "curves.png", dpi=130)
     (out / "table.md").write_text("\n".join(lines) + "\n")
@@ -133,15 +134,6 @@ def _write_curves(path: Path, metrics: dict[str, dict[str, np.ndarray]]) -> None
                 for k in range(columns["step"].shape[1]):
                     cells = [columns[name][i, k] for name in ("seed", "step", "episodes")]
                     writer.writerow((algo, *cells, f"{columns['return_agents'][i, k]:.4f}"))
-
-
-def _welch(a: np.ndarray, b: np.ndarray) -> float:
-    """Half width of the 95 % interval of the difference of two means (Welch)."""
-    from scipy.special import stdtrit
-
-    va, vb = a.var(ddof=1) / len(a), b.var(ddof=1) / len(b)
-    freedom = (va + vb) ** 2 / (va**2 / (len(a) - 1) + vb**2 / (len(b) - 1))
-    return float(stdtrit(freedom, 0.975) * np.sqrt(va + vb))
 
 
 if __name__ == "__main__":

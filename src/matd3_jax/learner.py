@@ -139,9 +139,9 @@ def update(
     noises = [_noise(spec, group, rows.shape[:2], k) for group, k in zip(spec.groups, keys, strict=True)]
     new, metrics = list(state), jnp.full((3, spec.num_agents), jnp.nan)
 
-    def member(g: int, targets: Sequence[chex.ArrayTree]):
+    def member(g: int, targets: Sequence[chex.ArrayTree], next_action: chex.Array | None = None):
         def f(args):
-            return _update_agent(spec, spec.groups[g], hyper[g], move[g], targets, *args)
+            return _update_agent(spec, spec.groups[g], hyper[g], move[g], targets, *args, next_action)
 
         return f
 
@@ -156,7 +156,14 @@ def update(
     else:
         for g, group in enumerate(spec.groups):
             args = (state[g], mu_targets[g], batches[g], noises[g])
-            new[g], m = jax.lax.map(member(g, mu_targets), args, batch_size=None if one_by_one else len(group.members))
+            next_action = None
+            if rows.shape[0] == 1 and group.algorithm.critic == "central":
+                # One minibatch for all: its target actions are the same for every member, so compute them once.
+                _, *first = jax.tree.map(lambda leaf: leaf[0], args)
+                next_action = _target_actions(spec, group, hyper[g], mu_targets, *first)
+            new[g], m = jax.lax.map(
+                member(g, mu_targets, next_action), args, batch_size=None if one_by_one else len(group.members)
+            )
             metrics = metrics.at[:, jnp.array(group.members)].set(jnp.stack(m))
     return tuple(new), UpdateMetrics(*metrics)
 
@@ -171,27 +178,16 @@ def _update_agent(
     own_target: chex.ArrayTree,
     batch: Minibatch,
     noise: Noise,
+    next_action: chex.Array | None = None,
 ) -> tuple[GroupState, tuple[chex.Array, chex.Array, chex.Array]]:
-    """One agent: (its state, (critic loss, Q, actor loss)). `state`: without the members' axis."""
+    """One agent: (its state, (critic loss, Q, actor loss)). `state`: without the members' axis; `next_action`: the
+    target actions, where they are known already."""
     algorithm, space = group.algorithm, group.action_space
     actor = networks.actor_network((), algorithm.hidden, space)
     critic = networks.critic_network(algorithm.num_critics, algorithm.hidden)
 
-    # a'_j = mu'_j(o'_j) + epsilon, one sample for all critics of the agent
-    if algorithm.critic == "central":
-        others = [(other, params, actor_of(other)) for other, params in zip(spec.groups, mu_targets, strict=True)]
-    else:
-        others = [(group, own_target, actor)]
-    parts = []
-    for j, (other, params, network) in enumerate(others):
-        output = apply(network, params, batch.next_observations[j])
-        part = networks.act(other.action_space, output, noise.target[j])
-        if noise.smoothing[j] is not None:
-            part = networks.smooth(
-                other.action_space, part, noise.smoothing[j], hyper.target_noise, hyper.target_noise_clip
-            )
-        parts.append(part)
-    next_action = spec.join_actions(parts) if algorithm.critic == "central" else parts[0]
+    if next_action is None:
+        next_action = _target_actions(spec, group, hyper, mu_targets, own_target, batch, noise)
 
     # y_i = r_i + gamma * min_j Q'_ij(x', a'_1, ..., a'_N)
     next_inputs = jnp.concatenate([batch.next_x, next_action], axis=-1)
@@ -234,6 +230,31 @@ def _update_agent(
         critic_target=optax.incremental_update(q_params, state.critic_target, hyper.tau),
     )
     return state, (loss, q_value, mu_loss)
+
+
+def _target_actions(
+    spec: Spec,
+    group: Group,
+    hyper: HyperParams,
+    mu_targets: Sequence[chex.ArrayTree],
+    own_target: chex.ArrayTree,
+    batch: Minibatch,
+    noise: Noise,
+) -> chex.Array:
+    """a'_j = mu'_j(o'_j) + epsilon, one sample for all critics of an agent: [batch, action size], joint or own."""
+    if group.algorithm.critic == "central":
+        others = [(other, params, actor_of(other)) for other, params in zip(spec.groups, mu_targets, strict=True)]
+    else:
+        own = networks.actor_network((), group.algorithm.hidden, group.action_space)
+        others = [(group, own_target, own)]
+    parts = []
+    for j, (other, params, network) in enumerate(others):
+        space = other.action_space
+        part = networks.act(space, apply(network, params, batch.next_observations[j]), noise.target[j])
+        if noise.smoothing[j] is not None:
+            part = networks.smooth(space, part, noise.smoothing[j], hyper.target_noise, hyper.target_noise_clip)
+        parts.append(part)
+    return spec.join_actions(parts) if group.algorithm.critic == "central" else parts[0]
 
 
 def _minibatches(spec: Spec, group: Group, rows: chex.Array) -> Minibatch:

@@ -24,7 +24,7 @@ def write(rows: chex.Array, new: chex.Array, count: chex.Array) -> chex.Array:
     return jax.lax.dynamic_update_slice(rows, new, (0, count % (capacity // n) * n, 0))
 
 
-def filled(capacity: int, n: int, count: chex.Array) -> chex.Array:
+def filled(capacity: int, n: int, count: chex.Array | int) -> chex.Array:
     """Number of valid rows after `count` writes of n rows each."""
     return jnp.minimum(count, capacity // n) * n
 

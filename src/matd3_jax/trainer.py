@@ -151,7 +151,7 @@ class Trainer:
 
     def filled_rows(self, collects: int) -> int:
         """Transitions in each seed's replay after `collects` collects."""
-        return min(self.env_steps(collects), self.schedule.replay_capacity)
+        return int(replay.filled(self.schedule.replay_capacity, self.schedule.collect_steps, collects))
 
     # ---- seeds over devices ------------------------------------------------------------------------------------------
 
