@@ -66,7 +66,7 @@ def main(argv: Sequence[str]) -> int:
 def measure(overrides: Sequence[str], seeds: int, repeats: int, seconds: float) -> list[dict[str, Any]]:
     """Rows of the table for one number of seeds."""
     # Replay no larger than a short run needs: its size does not change the work, only the memory.
-    settings = config.load([f"seeds={seeds}", "total_steps=100000", *overrides])
+    settings = config.load([f"seeds={seeds}", "total_steps=100000", "eval_every=0", *overrides])
     training = Training(settings)
     training.check_memory()
     trainer = training.trainer

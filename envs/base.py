@@ -167,6 +167,11 @@ class Environment(abc.ABC):
         """Number of entries of `full_observation`."""
         return sum(self.observation_sizes)
 
+    @property
+    def measures(self) -> tuple[str, ...]:
+        """Names of what `measure` gives, units in the docstring of the environment: evaluations report their means."""
+        return ()
+
     @abc.abstractmethod
     def reset(self, key: chex.PRNGKey) -> tuple[Any, tuple[chex.Array, ...]]:
         """Start an episode: (state, one observation per agent)."""
@@ -182,6 +187,10 @@ class Environment(abc.ABC):
     def full_observation(self, state: Any) -> chex.Array:
         """What a single agent in everybody's place sees: [full_observation_size]. By default all observations."""
         return jnp.concatenate(self.observe(state))
+
+    def measure(self, state: Any) -> chex.Array:
+        """Quantities of the env step that led to `state`, besides the rewards: [len(measures)]."""
+        return jnp.zeros(len(self.measures))
 
 
 def nearest(word: object, known: Iterable[str]) -> str:

@@ -72,8 +72,15 @@ class JointTeam(Environment):
     def full_observation_size(self) -> int:
         return self.env.full_observation_size
 
+    @property
+    def measures(self) -> tuple[str, ...]:
+        return self.env.measures
+
     def full_observation(self, state: Any) -> chex.Array:
         return self.env.full_observation(state)
+
+    def measure(self, state: Any) -> chex.Array:
+        return self.env.measure(state)
 
     def reset(self, key: chex.PRNGKey) -> tuple[Any, tuple[chex.Array, ...]]:
         state, observation = self.env.reset(key)

@@ -54,6 +54,13 @@ class Ledger(Environment):
     def action_spaces(self):
         return (Simplex((2,)),) * len(self.teams)
 
+    @property
+    def measures(self):
+        return ("number", "step")
+
+    def measure(self, state):
+        return jnp.stack([state.number, state.step.astype(jnp.float32)])
+
     def reset(self, key):
         number = jax.random.uniform(key, minval=0.01, maxval=0.99)
         state = LedgerState(number, jnp.int32(0), jnp.zeros(len(self.teams)))

@@ -1,6 +1,7 @@
 """Settings: what the files say, what overrides do, and one clear line for every mistake."""
 
 import dataclasses
+import json
 
 import pytest
 
@@ -89,6 +90,14 @@ def test_written_settings_read_back_the_same(tmp_path):
     assert config.read(tmp_path / "config.yaml") == settings
 
 
+def test_settings_of_a_run_from_before_a_key_mean_what_they_meant(tmp_path):
+    """Such a run had no evaluations on the way: its table has no columns for them, and must get none on resume."""
+    old = config.load(["eval_every=0"])
+    kept = {key: value for key, value in old.to_dict().items() if key not in config.ADDED_LATER}
+    (tmp_path / "config.yaml").write_text(json.dumps(kept))  # JSON is YAML
+    assert config.read(tmp_path / "config.yaml") == old
+
+
 MISTAKES = {
     "algo=mad3": "matd3",
     "env=simple_sprad": "simple_spread",
@@ -129,6 +138,8 @@ MISTAKES = {
     "total_steps=1000": "learning_starts",
     "total_steps=0": "total_steps=0",
     "log_every=0": "log_every",
+    "eval_every=-1": "eval_every=-1",
+    "eval_episodes=0": "eval_episodes=0",
     "keep_checkpoints=0": "keep_checkpoints=0",
     "algo.lr=${nothing}": "nothing",
     "=3": "key",

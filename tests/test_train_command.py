@@ -22,6 +22,7 @@ train = importlib.import_module("matd3_jax.train")  # the name in the package is
 TINY = [
     "env=simple_push", "adversary=maddpg", "seeds=3", "algo.hidden=[8]", "adversary.hidden=[8]", "batch_size=16",
     "num_envs=2", "learning_starts=200", "replay_capacity=500", "total_steps=1500", "log_every=200",
+    "eval_every=400", "eval_episodes=5",
 ]  # fmt: skip
 
 
@@ -77,8 +78,32 @@ def test_the_metrics_table_is_tidy(whole):
         assert float(row["return_agents"]) == pytest.approx(float(row["agent_0_return"]))
         assert float(row["return_adversaries"]) == pytest.approx(float(row["adversary_0_return"]))
     assert sum(int(row["episodes"]) for row in table if row["seed"] == "1") == steps[-1] // 25
+    evaluated = sorted({int(row["step"]) for row in table if row["eval_return_agents"] != "nan"})
+    assert evaluated == [150, 550, 950, 1350, 1550]  # chunks of 200 from 150 on: 400, 800, 1200, and the end
     late = [row for row in table if int(row["step"]) > 150]
     assert all(np.isfinite(float(row["agent_0_critic_loss"])) for row in late)
+
+
+def test_evaluations_are_told_of(whole, tmp_path, capsys):
+    """The last evaluation, of the table's last rows, on the progress line, in the lines at the end and in the summary;
+    without evaluations no word of them."""
+    last = {name: np.array([float(row[name]) for row in rows(whole)[-3:]]) for name in rows(whole)[-1]}
+    summary = json.loads((whole / "summary.json").read_text())["last_evaluation"]
+    names = ("return_agents", "return_adversaries", "episode_length")
+    assert set(summary) == {*names, "adversary_0_return", "agent_0_return"}
+    for name in names:
+        # Student's t of 2 degrees of freedom, from a table: 4.303.
+        want = last[f"eval_{name}"].mean(), 4.303 * last[f"eval_{name}"].std(ddof=1) / np.sqrt(3)
+        np.testing.assert_allclose(summary[name], want, rtol=1e-4)
+    assert run(tmp_path, "name=again") == 0
+    printed = capsys.readouterr().out
+    mean, spread = last["eval_return_agents"].mean(), last["eval_return_agents"].std(ddof=1)
+    assert f"(evaluation {mean:.1f} ± {spread:.1f})" in printed
+    assert f"\n  return_agents: {mean:.4g} ± " in printed and "\n  episode_length: 25 ± 0 " in printed
+    assert run(tmp_path, "name=never", "eval_every=0", "seeds=1", "total_steps=400") == 0
+    printed = capsys.readouterr().out
+    assert "(evaluation" not in printed and "last evaluation" not in printed
+    assert "last_evaluation" not in json.loads((tmp_path / "never" / "summary.json").read_text())
 
 
 def test_stopped_and_resumed_is_the_same_to_the_bit(whole, tmp_path, monkeypatch, capsys):
@@ -160,14 +185,15 @@ def test_evaluate_prints_and_leaves_a_table(whole, capsys):
     printed = capsys.readouterr().out
     with (whole / "evaluation.csv").open(newline="") as file:
         table = list(csv.DictReader(file))
-    who = ["adversary_0", "agent_0", "team adversaries", "team agents"]
-    assert [(r["policy"], r["who"], r["seed"]) for r in table] == [
-        (policy, name, str(seed)) for policy in ("deterministic", "sampled") for name in who for seed in range(3)
+    names = ["return_adversaries", "return_agents", "adversary_0_return", "agent_0_return", "episode_length"]
+    assert [(r["policy"], r["quantity"], r["seed"]) for r in table] == [
+        (policy, name, str(seed)) for policy in ("deterministic", "sampled") for name in names for seed in range(3)
     ]
-    assert all(word in printed for word in ("deterministic", "sampled", "team adversaries", "seed 2"))
-    values = {(r["policy"], r["who"], r["seed"]): float(r["mean_return"]) for r in table}
-    assert values["deterministic", "agent_0", "0"] != values["sampled", "agent_0", "0"]
-    assert values["sampled", "agent_0", "1"] == values["sampled", "team agents", "1"]
+    assert all(word in printed for word in ("deterministic", "sampled", "return_adversaries", "seed 2"))
+    values = {(r["policy"], r["quantity"], r["seed"]): float(r["mean"]) for r in table}
+    assert values["deterministic", "agent_0_return", "0"] != values["sampled", "agent_0_return", "0"]
+    assert values["sampled", "agent_0_return", "1"] == values["sampled", "return_agents", "1"]
+    assert values["sampled", "episode_length", "2"] == 25
     # The same start states and policies again: the same numbers.
     before = (whole / "evaluation.csv").read_bytes()
     evaluate.main([f"run={whole}", "episodes=20"])

@@ -290,7 +290,7 @@ def test_evaluate():
     trainer, _, _, _ = main_run()
     state, _ = start(trainer, [0, 1, 2])
     keys = jax.vmap(jax.random.key)(jnp.arange(3))
-    returns, lengths = map(np.asarray, trainer.evaluate(state, keys, 40, deterministic=True))
+    returns, lengths, _ = map(np.asarray, trainer.evaluate(state, keys, 40, deterministic=True))
     assert returns.shape == (3, 40, 2) and lengths.shape == (3, 40)
     assert set(np.unique(lengths)) == {ENDS, LIMIT}
     # Reward at step t is total + 10 i; totals grow by the action's first entry, between 0 and 1.

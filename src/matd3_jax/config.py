@@ -18,6 +18,9 @@ from matd3_jax.errors import UserError
 from matd3_jax.typed import plain, typed
 from matd3_jax.validation import check
 
+ADDED_LATER = {"eval_every": 0, "eval_episodes": 10}
+"""Keys that runs from before them lack, with the values that those runs had in effect."""
+
 GROUPS = ("env", "algo", "adversary")
 """Keys that choose a file; `adversary` takes the files of `algo`."""
 
@@ -79,6 +82,8 @@ class Config:
     name: str | None
     out: str
     log_every: int | None
+    eval_every: int | None
+    eval_episodes: int
     checkpoint_every: int | None
     keep_checkpoints: int
     tensorboard: bool
@@ -170,7 +175,7 @@ def read(path: Path) -> Config:
     try:
         found = OmegaConf.to_container(OmegaConf.load(path))
         assert isinstance(found, dict)
-        return from_dict(found)  # type: ignore[arg-type]
+        return from_dict({**ADDED_LATER, **found})  # type: ignore[dict-item]
     except (OSError, AssertionError, ValueError, OmegaConfBaseException) as error:
         raise UserError(f"cannot read the configuration {path}: {_one_line(error)}") from error
 

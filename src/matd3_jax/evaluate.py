@@ -12,6 +12,7 @@ from rich.table import Table
 from matd3_jax import checkpoint, command, config, devices
 from matd3_jax.envs.base import nearest
 from matd3_jax.errors import UserError
+from matd3_jax.rollout import Evaluation
 from matd3_jax.runs import RunDirectory
 from matd3_jax.statistics import mean_interval
 from matd3_jax.training import Training
@@ -19,7 +20,7 @@ from matd3_jax.training import Training
 HELP = """usage: python -m matd3_jax.evaluate run=RUN_DIR [episodes=100] [seed=0] [checkpoint=STEP]
 
 Plays `episodes` episodes with every seed's policies, deterministic (no noise) and sampled (as in training), from the
-start states that `seed` gives; prints mean returns and writes every number to RUN_DIR/evaluation.csv."""
+start states that `seed` gives; prints means over the episodes and writes every number to RUN_DIR/evaluation.csv."""
 
 DEFAULTS: dict[str, Any] = {"run": None, "episodes": 100, "seed": 0, "checkpoint": None}
 
@@ -35,37 +36,38 @@ def main(argv: Sequence[str]) -> int:
     training = Training(settings)
     path = checkpoint.verify(run.checkpoints, options["checkpoint"])
     state = checkpoint.restore_actors(path, training.trainer)
-    table = Table(title=f"{run.path}, env step {int(path.name):,}: return of {options['episodes']} episodes a seed")
-    for heading in ("policy", "who", *(f"seed {settings.seed + i}" for i in range(settings.seeds)), "mean ± 95 %"):
-        table.add_column(heading, justify="left" if heading in ("policy", "who") else "right")
+    table = Table(title=f"{run.path}, env step {int(path.name):,}: means of {options['episodes']} episodes a seed")
+    for heading in ("policy", "quantity", *(f"seed {settings.seed + i}" for i in range(settings.seeds)), "mean ± 95 %"):
+        table.add_column(heading, justify="left" if heading in ("policy", "quantity") else "right")
     rows = []
     for policy in ("deterministic", "sampled"):
-        returns = training.evaluate(state, options["episodes"], policy == "deterministic", options["seed"])
-        for who, by_episode in _parts(training, returns):
+        found = training.evaluate(state, options["episodes"], policy == "deterministic", options["seed"])
+        for quantity, by_episode in _quantities(training, found):
             by_seed = by_episode.mean(axis=1)
             mean, half = mean_interval(by_seed)
             interval = f"{mean:.2f}" + (f" ± {half:.2f}" if settings.seeds > 1 else "")
-            table.add_row(policy, who, *(f"{value:.2f}" for value in by_seed), interval)
+            table.add_row(policy, quantity, *(f"{value:.2f}" for value in by_seed), interval)
             spread = by_episode.std(axis=1, ddof=1) if options["episodes"] > 1 else np.full(settings.seeds, np.nan)
             rows += [
-                (policy, who, settings.seed + i, by_seed[i], spread[i], options["episodes"])
+                (policy, quantity, settings.seed + i, by_seed[i], spread[i], options["episodes"])
                 for i in range(settings.seeds)
             ]
         table.add_section()
     Console(width=None if Console().is_terminal else 200).print(table)
     with (run.path / "evaluation.csv").open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(("policy", "who", "seed", "mean_return", "std_return", "episodes"))
+        writer.writerow(("policy", "quantity", "seed", "mean", "std", "episodes"))
         writer.writerows(rows)
     return 0
 
 
-def _parts(training: Training, returns: np.ndarray) -> list[tuple[str, np.ndarray]]:
-    """(name, returns [seeds, episodes]) of every agent, then of every team."""
-    spec = training.spec
-    agents = [(agent, returns[:, :, i]) for i, agent in enumerate(spec.agents)]
-    teams = dict.fromkeys(spec.teams)
-    return agents + [(f"team {team}", returns @ training.team_weights(team)) for team in teams]
+def _quantities(training: Training, found: Evaluation) -> list[tuple[str, np.ndarray]]:
+    """(name, values [seeds, episodes]): returns by team and agent, length, measures; names as in the metrics table."""
+    spec, returns = training.spec, np.asarray(found.episode_return)
+    teams = [(f"return_{team}", returns @ training.team_weights(team)) for team in dict.fromkeys(spec.teams)]
+    agents = [(f"{agent}_return", returns[:, :, i]) for i, agent in enumerate(spec.agents)]
+    measures = [(name, np.asarray(found.measures)[:, :, k]) for k, name in enumerate(training.env.measures)]
+    return [*teams, *agents, ("episode_length", np.asarray(found.length)), *measures]
 
 
 def _options(argv: Sequence[str]) -> dict[str, Any]:

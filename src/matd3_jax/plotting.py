@@ -11,7 +11,8 @@ from matd3_jax.statistics import mean_interval
 
 
 def learning_curve(path: Path, metrics: Mapping[str, np.ndarray], title: str) -> None:
-    """Draw the training return of every team over env steps: each seed, their mean, and its 95 % interval.
+    """Draw the return of every team over env steps, in training and (where there are any) in evaluations: each seed,
+    their mean, and its 95 % interval.
 
     Args:
         metrics: columns [rows] of the metrics table.
@@ -21,15 +22,27 @@ def learning_curve(path: Path, metrics: Mapping[str, np.ndarray], title: str) ->
     FigureCanvasAgg(figure)
     axes = np.atleast_1d(np.asarray(figure.subplots(len(teams), sharex=True), dtype=object))
     seeds = np.unique(metrics["seed"])
+    who = f"mean of {len(seeds)} seeds, 95 % interval" if len(seeds) > 1 else "one seed"
     for axis, team, colour in zip(axes, teams, ("tab:blue", "tab:red"), strict=False):
-        curves = np.stack([metrics[team][metrics["seed"] == seed] for seed in seeds])
-        steps = metrics["step"][metrics["seed"] == seeds[0]]
-        curve(axis, steps, curves, colour, f"mean of {len(seeds)} seeds, 95 % interval", each=True)
-        axis.set_ylabel(f"training return\n{team.removeprefix('return_')}")
+        evaluated = f"eval_{team}" in metrics
+        kinds = [(team, "training (exploring)", "tab:gray" if evaluated else colour)]
+        kinds += [(f"eval_{team}", "evaluation (deterministic)", colour)] if evaluated else []
+        for name, kind, shade in kinds:
+            steps, curves = by_seed(metrics, name)
+            curve(axis, steps, curves, shade, f"{kind}, {who}", each=True)
+        axis.set_ylabel(f"return\n{team.removeprefix('return_')}")
         axis.legend(loc="lower right", frameon=False)
     axes[-1].set_xlabel("env steps of each seed")
     axes[0].set_title(title)
     figure.savefig(path, dpi=120)
+
+
+def by_seed(metrics: Mapping[str, np.ndarray], name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Env steps [points] and values [seeds, points] of a column where it is not nan for all seeds."""
+    seeds = np.unique(metrics["seed"])
+    values = np.stack([metrics[name][metrics["seed"] == seed] for seed in seeds])
+    there = ~np.isnan(values).all(axis=0)
+    return metrics["step"][metrics["seed"] == seeds[0]][there], values[:, there]
 
 
 def curve(axis, steps: np.ndarray, curves: np.ndarray, colour: str, label: str, each: bool = False) -> None:

@@ -13,14 +13,21 @@ SECONDS_BETWEEN_LINES = 10
 
 
 class ProgressBar:
-    """Env steps/s, updates/s (both over all seeds), time left, and each team's mean return with its spread over seeds.
+    """Env steps/s, updates/s (both over all seeds), time left, and each team's mean return with its spread over seeds:
+    in training and, behind it, in the last evaluation.
 
-    Rates and time left are measured from the end of the first chunk on, which holds the compilation.
+    Rates and time left are measured from the end of the first chunk on, which holds the compilation; evaluations count.
+
+    Args:
+        row: where the run stands.
     """
 
-    def __init__(self, total_steps: int, seeds: int, step: int, updates: int):
+    def __init__(self, total_steps: int, seeds: int, row: Row):
         self.total, self.seeds = total_steps, seeds
-        self.first = self.last = (time.monotonic(), step, updates)
+        step = int(row["step"][0])
+        self.first = self.last = (time.monotonic(), step, int(row["updates"][0]))
+        self.evaluation: Row = {}
+        self._note_evaluation(row)
         self.warm = False
         self.printed = 0.0
         self.console = Console(file=sys.stdout)
@@ -35,6 +42,7 @@ class ProgressBar:
         """Tell of one more chunk."""
         now, step, updates = time.monotonic(), int(row["step"][0]), int(row["updates"][0])
         self.last = (now, step, updates)
+        self._note_evaluation(row)
         text = f"{step:,}/{self.total:,} env steps"
         if self.warm:
             seconds = now - self.first[0]
@@ -47,6 +55,8 @@ class ProgressBar:
         for name in row:
             if name.startswith("return_"):
                 text += f" | {name.removeprefix('return_')} {_spread(row[name])}"
+                if f"eval_{name}" in self.evaluation:
+                    text += f" (evaluation {_spread(self.evaluation[f'eval_{name}'])})"
         if self.bar is not None:
             self.bar.update(self.task, completed=step, description=text)
         elif now - self.printed >= SECONDS_BETWEEN_LINES or step >= self.total:
@@ -62,6 +72,11 @@ class ProgressBar:
             "env_steps_per_second": (self.last[1] - self.first[1]) * self.seeds / seconds,
             "updates_per_second": (self.last[2] - self.first[2]) * self.seeds / seconds,
         }
+
+    def _note_evaluation(self, row: Row) -> None:
+        found = {name: values for name, values in row.items() if name.startswith("eval_return_")}
+        if not any(np.isnan(values).any() for values in found.values()):
+            self.evaluation = found or self.evaluation
 
     def stop(self) -> None:
         if self.bar is not None:

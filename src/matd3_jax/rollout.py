@@ -33,6 +33,17 @@ class Episodes(NamedTuple):
     length: chex.Array
 
 
+class Evaluation(NamedTuple):
+    """Whole episodes, each played in an environment of its own."""
+
+    episode_return: chex.Array
+    """[episodes, num_agents] undiscounted."""
+    length: chex.Array
+    """[episodes] env steps."""
+    measures: chex.Array
+    """[episodes, measures] of the environment (`Environment.measures`), means over the env steps of the episode."""
+
+
 def start(env: Environment, key: chex.PRNGKey, num_envs: int) -> EnvState:
     """Fresh episodes in `num_envs` environments."""
     state, observation = jax.vmap(env.reset)(jax.random.split(key, num_envs))
@@ -98,34 +109,40 @@ def evaluate(
     key: chex.PRNGKey,
     episodes: int,
     deterministic: bool,
-) -> tuple[chex.Array, chex.Array]:
-    """Undiscounted returns [episodes, num_agents] and lengths [episodes] of whole episodes, each in an own environment.
+) -> Evaluation:
+    """Play `episodes` whole episodes side by side; stops as soon as all have ended.
 
     deterministic: no noise at all (softmax of the logits, likeliest choice, squashed output); otherwise the policies
     act as they do while collecting.
     """
     state_key, step_key = jax.random.split(key)
+    step_keys = jax.random.split(step_key, env.episode_length)
     env_state = start(env, state_key, episodes)
 
-    def step(carry, key):
-        env_state, running = carry
-        act_key, env_key = jax.random.split(key)
+    def going(carry):
+        t, _, _, running = carry
+        return (t < env.episode_length) & running.any()
+
+    def step(carry):
+        t, env_state, measured, running = carry
+        act_key, env_key = jax.random.split(step_keys[t])
         draws = None
         if not deterministic:
             draws = _noise(spec, act_key, (episodes,))
         actions = env_actions(spec, act(spec, actors, hyper, env_state.observation, draws))
         after = jax.vmap(env.step)(jax.random.split(env_key, episodes), env_state.state, actions)
+        measured += jnp.where(running[:, None], jax.vmap(env.measure)(after.state), 0)
         env_state = EnvState(
             after.state,
             after.observation,
             env_state.episode_return + jnp.where(running[:, None], after.reward, 0),
             env_state.episode_step + running,
         )
-        return (env_state, running & ~(after.terminated | after.truncated)), None
+        return t + 1, env_state, measured, running & ~(after.terminated | after.truncated)
 
-    carry = (env_state, jnp.ones(episodes, bool))
-    (env_state, _), _ = jax.lax.scan(step, carry, jax.random.split(step_key, env.episode_length))
-    return env_state.episode_return, env_state.episode_step
+    carry = (jnp.int32(0), env_state, jnp.zeros((episodes, len(env.measures))), jnp.ones(episodes, bool))
+    _, env_state, measured, _ = jax.lax.while_loop(going, step, carry)
+    return Evaluation(env_state.episode_return, env_state.episode_step, measured / env_state.episode_step[:, None])
 
 
 def act(

@@ -96,7 +96,7 @@ def _advance(training: Training, run: RunDirectory, state: TrainState, row: dict
     """Chunk after chunk to the end, or until a signal comes."""
     settings, begun = training.config, time.monotonic()
     step = int(row["step"][0])
-    progress = ProgressBar(training.total_steps, settings.seeds, step, int(row["updates"][0]))
+    progress = ProgressBar(training.total_steps, settings.seeds, row)
     writer = _tensorboard_writer(settings, run)
     every = training.total_steps / 5 if settings.checkpoint_every is None else settings.checkpoint_every
     saved = step
@@ -122,17 +122,27 @@ def _advance(training: Training, run: RunDirectory, state: TrainState, row: dict
         print(f"stopped by {stop.signal.name} at env step {step:,}; go on with: "
               f"python -m matd3_jax.train resume={run.path}")  # fmt: skip
         return 128 + stop.signal
-    finals = _finals(metrics, settings)
+    finals = _finals(metrics)
     summary = {
         "total_steps": step,
         "seconds": round(time.monotonic() - begun, 1),
         **progress.rates(),
         "last_tenth": finals,
     }
+    over = f"(95 % interval over {settings.seeds} seeds)"
+    for team, final in finals.items():
+        print(f"mean training return of {team} over the last tenth: {_interval(final, over)}")
+    if training.eval_every:
+        summary["last_evaluation"] = {
+            name.replace("eval_", "", 1): _final(values)
+            for name, values in row.items()
+            if name.startswith("eval_") or name.endswith("_eval_return")
+        }
+        print(f"last evaluation ({settings.eval_episodes} deterministic episodes of each seed):")
+        for name, values in row.items():
+            if name.startswith("eval_"):
+                print(f"  {name.removeprefix('eval_')}: {_interval(_final(values), over)}")
     run.write_summary(summary)
-    for team, (mean, half) in finals.items():
-        spread = f" ± {half:.1f} (95 % interval over {settings.seeds} seeds)" if settings.seeds > 1 else ""
-        print(f"mean training return of {team} over the last tenth: {mean:.1f}{spread}")
     print(f"learning curve: {run.curve}\nevaluate with: python -m matd3_jax.evaluate run={run.path}")
     return 0
 
@@ -172,15 +182,25 @@ def _name(settings: Config) -> str:
     return f"{settings.env['name']}-{settings.algo.name}{against}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
-def _finals(metrics: dict[str, np.ndarray], settings: Config) -> dict[str, tuple[float, float]]:
-    """For each team mean and 95 % half width over seeds of the mean return in the last tenth of the run."""
+def _finals(metrics: dict[str, np.ndarray]) -> dict[str, tuple[float, float | None]]:
+    """For each team `_final` of the mean training return in the last tenth of the run."""
     late = metrics["step"] > 0.9 * metrics["step"].max()
     finals = {}
     for name in (name for name in metrics if name.startswith("return_")):
         by_seed = [np.nanmean(metrics[name][late & (metrics["seed"] == s)]) for s in np.unique(metrics["seed"])]
-        mean, half = mean_interval(np.array(by_seed))
-        finals[name.removeprefix("return_")] = (float(mean), float(half))
+        finals[name.removeprefix("return_")] = _final(np.array(by_seed))
     return finals
+
+
+def _final(values: np.ndarray) -> tuple[float, float | None]:
+    """Mean and 95 % half width over seeds; None with one seed."""
+    mean, half = mean_interval(values)
+    return float(mean), float(half) if len(values) > 1 else None
+
+
+def _interval(final: tuple[float, float | None], over: str) -> str:
+    mean, half = final
+    return f"{mean:.4g}" if half is None else f"{mean:.4g} ± {half:.2g} {over}"
 
 
 def _tensorboard_writer(settings: Config, run: RunDirectory | None) -> Any:

@@ -17,7 +17,7 @@ from matd3_jax import learner, replay, rollout
 from matd3_jax.algorithms import HyperParams
 from matd3_jax.envs.base import Environment
 from matd3_jax.learner import GroupState, UpdateMetrics
-from matd3_jax.rollout import EnvState, Episodes
+from matd3_jax.rollout import EnvState, Episodes, Evaluation
 from matd3_jax.spec import Spec
 
 
@@ -289,16 +289,25 @@ class Trainer:
         specs = (self._specs, P("seeds"))
         return Program(jax.jit(self._sharded(repeat, specs, specs), donate_argnums=0), self.hyper, cycles)
 
-    def evaluate(self, state: TrainState, keys: chex.PRNGKey, episodes: int, deterministic: bool):
-        """`rollout.evaluate` of each seed: returns [num_seeds, episodes, num_agents], lengths [num_seeds, episodes]."""
+    def evaluate(self, state: TrainState, keys: chex.PRNGKey, episodes: int, deterministic: bool) -> Evaluation:
+        """`rollout.evaluate` of each seed, leading axis [num_seeds]; one program for each kind and number of episodes.
 
-        def one(groups, hyper, key):
-            actors = [group.actor for group in groups]
-            return rollout.evaluate(self.env, self.spec, actors, hyper, key, episodes, deterministic)
+        Args:
+            keys: [num_seeds].
+        """
+        found = self._evaluate(state.groups, self.hyper, self.fill(keys), episodes, deterministic)
+        return jax.tree.map(lambda leaf: leaf[: self.num_seeds], found)
 
-        program = jax.jit(self._sharded(jax.vmap(one), P("seeds"), P("seeds")))
-        returns, lengths = program(state.groups, self.hyper, self.fill(keys))
-        return returns[: self.num_seeds], lengths[: self.num_seeds]
+    @cached_property
+    def _evaluate(self) -> Callable:
+        def evaluate(groups, hyper, keys, episodes, deterministic):
+            def one(groups, hyper, key):
+                actors = [group.actor for group in groups]
+                return rollout.evaluate(self.env, self.spec, actors, hyper, key, episodes, deterministic)
+
+            return self._sharded(jax.vmap(one), P("seeds"), P("seeds"))(groups, hyper, keys)
+
+        return jax.jit(evaluate, static_argnums=(3, 4))
 
 
 class Program(NamedTuple):

@@ -15,7 +15,7 @@ from matd3_jax.config import Config
 from matd3_jax.envs.base import Environment
 from matd3_jax.envs.joint import JointTeam
 from matd3_jax.errors import UserError
-from matd3_jax.rollout import Episodes
+from matd3_jax.rollout import Episodes, Evaluation
 from matd3_jax.spec import Spec
 from matd3_jax.trainer import Metrics, Program, Schedule, Trainer, TrainState
 
@@ -35,8 +35,8 @@ class Result:
     """Columns of the metrics table, each [seeds, chunks]; "step" is env steps of each seed."""
 
     def evaluate(self, episodes: int = 100, deterministic: bool = True, seed: int = 0) -> np.ndarray:
-        """Undiscounted returns [seeds, episodes, agents] of whole episodes (see `Trainer.evaluate`)."""
-        return self.training.evaluate(self.state, episodes, deterministic, seed)
+        """Undiscounted returns [seeds, episodes, agents] of whole episodes (see `Training.evaluate`)."""
+        return self.training.evaluate(self.state, episodes, deterministic, seed).episode_return
 
 
 class Training:
@@ -116,7 +116,8 @@ class Training:
         """The state after the prefill, and what the untrained policies got there."""
         self.check_memory()
         state, episodes = self.trainer.prefill(self.trainer.init(self.keys()))
-        return state, self.row(state, Metrics(episodes, None))  # type: ignore[arg-type]
+        row = self.row(state, Metrics(episodes, None))  # type: ignore[arg-type]
+        return state, {**row, **self.evaluation_columns(state)}
 
     @cached_property
     def chunk(self) -> Program:
@@ -124,9 +125,12 @@ class Training:
         return self.trainer.chunk(self.cycles_per_chunk)
 
     def advance(self, state: TrainState) -> tuple[TrainState, Row]:
-        """One chunk. The state given in is donated."""
+        """One chunk, and an evaluation where one is due. The state given in is donated."""
+        before = self.step(state)
         state, metrics = self.chunk(state)
-        return state, self.row(state, metrics)
+        step, every = self.step(state), self.eval_every
+        due = every > 0 and (step // every > before // every or step >= self.total_steps)
+        return state, {**self.row(state, metrics), **self.evaluation_columns(state if due else None)}
 
     def step(self, state: TrainState) -> int:
         """Env steps of each seed so far."""
@@ -163,10 +167,39 @@ class Training:
         member = np.array([t == team for t in self.spec.teams])
         return np.where(member, self.env.return_weights, 0.0)
 
-    def evaluate(self, state: TrainState, episodes: int, deterministic: bool, seed: int = 0) -> np.ndarray:
-        """Undiscounted returns [seeds, episodes, agents] of whole episodes; every seed starts from the same keys."""
-        keys = jax.vmap(lambda _: jax.random.key(seed))(np.arange(self.config.seeds))
-        return np.asarray(self.trainer.evaluate(state, keys, episodes, deterministic)[0], np.float64)
+    # ---- evaluation --------------------------------------------------------------------------------------------------
+
+    @property
+    def eval_every(self) -> int:
+        """Env steps between evaluations; 0: never."""
+        every = self.config.eval_every
+        return max(1, self.config.total_steps // 20) if every is None else every
+
+    def evaluate(self, state: TrainState, episodes: int, deterministic: bool, seed: int = 0) -> Evaluation:
+        """Whole episodes in float64, leading axis [seeds]; every seed of the run plays from the same start states,
+        which `seed` gives."""
+        # Apart from the training's keys, which are split from key(seed).
+        key = jax.random.fold_in(jax.random.key(seed), 2**31 - 1)
+        keys = jax.vmap(lambda _: key)(np.arange(self.config.seeds))
+        found = self.trainer.evaluate(state, keys, episodes, deterministic)
+        return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), found)
+
+    def evaluation_columns(self, state: TrainState | None) -> Row:
+        """What an evaluation adds to a row: means over `eval_episodes` deterministic episodes, from the same start
+        states every time; nan where `state` is None. No columns without evaluations."""
+        if not self.eval_every:
+            return {}
+        if state is None:
+            sizes = (self.spec.num_agents, 1, len(self.env.measures))
+            returns, length, measures = (np.full((self.config.seeds, size), np.nan) for size in sizes)
+        else:
+            found = self.evaluate(state, self.config.eval_episodes, deterministic=True)
+            returns, length, measures = (leaf.mean(axis=1).reshape(self.config.seeds, -1) for leaf in found)
+        columns = {f"eval_return_{team}": returns @ self.team_weights(team) for team in dict.fromkeys(self.spec.teams)}
+        columns["eval_episode_length"] = length[:, 0]
+        columns |= {f"eval_{name}": measures[:, k] for k, name in enumerate(self.env.measures)}
+        columns |= {f"{agent}_eval_return": returns[:, i] for i, agent in enumerate(self.spec.agents)}
+        return columns
 
 
 def train(

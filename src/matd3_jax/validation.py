@@ -25,12 +25,13 @@ def check(config: "Config") -> None:
             raise UserError(message)
 
     for key in ("total_steps", "seeds", "num_envs", "rollout_length", "updates_per_collect", "batch_size",
-                "replay_capacity", "learning_starts", "keep_checkpoints"):  # fmt: skip
+                "replay_capacity", "learning_starts", "eval_episodes", "keep_checkpoints"):  # fmt: skip
         need(getattr(config, key) >= 1, f"{key}={getattr(config, key)}: must be at least 1")
     need(0 <= config.seed < 2**31, f"seed={config.seed}: must be between 0 and {2**31 - 1}")
-    for key in ("log_every", "checkpoint_every"):
+    need(config.log_every is None or config.log_every >= 1, f"log_every={config.log_every}: must be positive")
+    for key in ("eval_every", "checkpoint_every"):
         value = getattr(config, key)
-        need(value is None or value >= (key == "log_every"), f"{key}={value}: must be positive")
+        need(value is None or value >= 0, f"{key}={value}: must not be negative")
     for name, team in {"algo": config.algo, "adversary": config.adversary}.items():
         if team is not None:
             _check_team(name, team, config.updates_per_collect, need)

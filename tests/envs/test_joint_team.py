@@ -1,5 +1,7 @@
 """JointTeam against the environment it wraps."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 
 from matd3_jax.envs import Box, Discrete, MultiDiscrete, OptionError, Simplex, make
 from matd3_jax.envs.joint import JointTeam, join_spaces
+from matd3_jax.envs.point import PointReach
 
 
 def sample(env, key):
@@ -38,6 +41,24 @@ def test_everybody(actions):
     np.testing.assert_allclose(got.observation[0], joint.observe(want.state)[0], atol=1e-6)
     np.testing.assert_allclose(got.reward, [want.reward.mean()], rtol=1e-6)
     np.testing.assert_allclose(got.reward @ np.array(joint.return_weights), want.reward.sum(), rtol=1e-6)
+
+
+def test_measures_are_the_wrapped_environments():
+    """Names and numbers pass through; an environment that says nothing of measures has none."""
+
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Measured(PointReach):
+        measures = ("target_x",)
+
+        def measure(self, state):
+            return state.target[:1]
+
+    joint = JointTeam(Measured())
+    state, _ = jax.jit(joint.reset)(jax.random.key(0))
+    assert joint.measures == ("target_x",)
+    np.testing.assert_array_equal(joint.measure(state), state.target[:1])
+    plain = JointTeam(PointReach())
+    assert plain.measures == () and plain.measure(state).shape == (0,)
 
 
 def test_one_team_of_two():
