@@ -32,6 +32,7 @@ class Case:
     """Teams whose actors and targets do not move in this update."""
     one_by_one: bool = True
     """How a group is computed: agent after agent, or all in one batch."""
+    n_step: int = 1
 
     @property
     def teams(self):
@@ -39,6 +40,9 @@ class Case:
         return load(self.algo, self.adversary)
 
     def spec(self) -> Spec:
+        return dataclasses.replace(self._spec(), n_step=self.n_step)
+
+    def _spec(self) -> Spec:
         if self.env == "interleaved":
             return interleaved(self.algorithms(("agents",))["agents"])
         env = make(self.env, **self.options)
@@ -104,6 +108,10 @@ CASES = {
     "matd3-shared-sequential": Case("simple_spread", "matd3", shared=True, sequential=True),
     "interleaved": Case("interleaved", "matd3", sequential=True, changes={"smoothing": True}),
     "interleaved-shared": Case("interleaved", "matd3", shared=True, one_by_one=False, changes={"smoothing": True}),
+    # Returns of several steps, discounted by each team's own gamma.
+    "n-step": Case("simple_tag", "matd3", "maddpg", n_step=3),
+    "n-step-own": Case("simple_crypto", "iltd3", shared=True, one_by_one=False, n_step=4),
+    "n-step-joint": Case("simple_adversary", "td3", "maddpg", sequential=True, n_step=2),
     # Action spaces, numbers of critics, clipping, Adam.
     "box": Case(
         "point_reach", "matd3", changes={"smoothing": True, "num_critics": 3, "clip": "network", "hidden": (6, 4)}
@@ -135,9 +143,15 @@ def random_state(spec, rng):
 
 
 def random_rows(spec, rng, batches, batch=BATCH):
-    """Replay rows [batches, batch, row_size]; every other transition terminates."""
-    rows = rng.normal(size=(batches, batch, spec.row_size))
-    rows[..., -1] = np.arange(batch) % 2
+    """Replay rows [batches, batch, row_size], every other transition terminates; with n_step > 1 [batches, batch,
+    n_step, row_size], half of them the last of their episode or environment, and half of those terminate."""
+    if spec.n_step == 1:
+        rows = rng.normal(size=(batches, batch, spec.row_size))
+        rows[..., -1] = np.arange(batch) % 2
+        return rows
+    rows = rng.normal(size=(batches, batch, spec.n_step, spec.row_size))
+    rows[..., -1] = rng.integers(0, 2, rows.shape[:-1])
+    rows[..., -2] = np.maximum(rows[..., -1], rng.integers(0, 2, rows.shape[:-1]))
     return rows
 
 

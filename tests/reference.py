@@ -170,11 +170,26 @@ def take_apart(rows, agents):
     return parts[:n], parts[n : 2 * n], [r[:, 0] for r in parts[2 * n : 3 * n]], parts[3 * n : 4 * n], parts[-1][:, 0]
 
 
+def long_step(rows, reward, next_x, discount, goes_on, gamma):
+    """n-step returns of consecutive rows [batch, n, row]: the first rows with the discounted sum of rewards, x' of the
+    last row that counts and discount gamma^(m - 1) (1 - terminated) in their places.
+
+    reward, next_x: slices of a row; discount, goes_on: its columns.
+    """
+    long = rows[:, 0].copy()
+    for b, steps in enumerate(rows):
+        m = next((k + 1 for k, row in enumerate(steps) if row[goes_on] == 0), len(steps))
+        long[b, reward] = sum(gamma**k * steps[k, reward] for k in range(m))
+        long[b, next_x] = steps[m - 1, next_x]
+        long[b, discount] = gamma ** (m - 1) * steps[m - 1, discount]
+    return long
+
+
 def update(agents, batches, gumbel, normal, move, sequential):
     """One update. Returns (agents after it, metrics [3, agents], number of clipped norms).
 
     Args:
-        batches: replay rows [batch, row] for each agent.
+        batches: replay rows [batch, row] for each agent, or [batch, n, row] for n-step returns.
         gumbel, normal: functions of an action size: the noise [batch, size] of every sample, and of the smoothing.
         move: for each agent whether its actor and targets move.
         sequential: agents see the moved target actors of those before them.
@@ -183,7 +198,12 @@ def update(agents, batches, gumbel, normal, move, sequential):
     metrics, clipped = np.full((3, len(agents)), np.nan), 0
     for i, agent in enumerate(agents):
         h, algorithm = agent.hyper, agent.algorithm
-        x, a, r, next_x, discount = take_apart(batches[i], agents)
+        rows = batches[i]
+        if rows.ndim == 3:
+            n, size = len(agents), sum(other.observation_size for other in agents)
+            reward, next_x = slice(-2 - size - n, -2 - size), slice(-2 - size, -2)
+            rows = long_step(rows, reward, next_x, discount=-2, goes_on=-1, gamma=h.gamma)
+        x, a, r, next_x, discount = take_apart(rows, agents)
         batch, central = len(batches[i]), algorithm.critic == "central"
 
         # Target: r + gamma min_j Q'_j(x', mu'(o')), bootstrapping unless terminated.

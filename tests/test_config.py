@@ -137,6 +137,8 @@ MISTAKES = {
     "learning_starts=0": "learning_starts=0",
     "total_steps=1000": "learning_starts",
     "total_steps=0": "total_steps=0",
+    "n_step=0": "n_step=0",
+    "n_step=250001": "n_step=250001 is more than the 250000 env steps",
     "log_every=0": "log_every",
     "eval_every=-1": "eval_every=-1",
     "eval_episodes=0": "eval_episodes=0",
@@ -172,6 +174,12 @@ def test_a_replay_that_cannot_fit_is_refused_with_the_arithmetic():
     training = Training(config.load(["seeds=20000", "total_steps=2000000"]))
     with pytest.raises(UserError, match=r"20000 seeds x 1,000,000 transitions x 127 numbers x 4 bytes = 10160.00 GB"):
         training.check_memory()
+
+
+def test_several_steps_need_one_number_more():
+    one, three = (Training(config.load([f"n_step={n}", "total_steps=100000"])) for n in (1, 3))
+    assert (one.spec.row_size, three.spec.row_size) == (127, 128)
+    assert "goes_on" not in one.memory and "x 128 numbers" in three.memory and "goes_on 1)" in three.memory
 
 
 def test_a_short_run_allocates_no_rows_it_would_never_write():

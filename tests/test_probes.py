@@ -34,6 +34,8 @@ HYPER = HYPER._replace(
     exploration_noise=0.5,
 )
 CRITICS, ACTORS = 0, 1
+N_STEP = {"matd3-3-step": ("matd3", 3)}
+"""Values of returns over several steps: the policies that the critics judge stay as they are, so they are the same."""
 
 pytestmark = pytest.mark.usefixtures("quick_jit")
 
@@ -91,7 +93,8 @@ ENV = Probes()
 @functools.cache
 def trained(name):
     """(spec, groups, replay) after 1,120 updates, in NumPy."""
-    spec = Spec.of(ENV, {"agents": ALGORITHMS[name]})
+    name, n_step = N_STEP.get(name, (name, 1))
+    spec = Spec.of(ENV, {"agents": ALGORITHMS[name]}, n_step)
     schedule = Schedule(
         num_envs=16, rollout_length=4, updates_per_collect=16, batch_size=64, replay_capacity=3200, learning_starts=64
     )
@@ -117,7 +120,7 @@ def values(name, agent, seed=CRITICS):
 
 
 @pytest.mark.parametrize("agent", ["late", "constant", "signal"])
-@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize("name", [*ALGORITHMS, *N_STEP])
 def test_values(name, agent):
     """Values that no action changes, in all six observations.
 

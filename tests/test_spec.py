@@ -58,7 +58,8 @@ def test_layout(env):
     joint = [np.concatenate(parts, axis=-1) for parts in (x, actions, next_x)]
     assert (spec.observation_size, spec.action_size) == (joint[0].shape[-1], joint[1].shape[-1])
 
-    rows = spec.pack_rows(joint[0], joint[1], reward, joint[2], jnp.asarray(terminated))
+    truncated = rng.random(lead) < 0.5
+    rows = spec.pack_rows(joint[0], joint[1], reward, joint[2], jnp.asarray(terminated), jnp.asarray(truncated))
     plain = np.concatenate([*x, *actions, reward, *next_x, 1.0 - terminated[..., None]], axis=-1)
     assert rows.shape == (*lead, spec.row_size) and rows.dtype == np.float32
     np.testing.assert_array_equal(rows, plain)
@@ -79,6 +80,15 @@ def test_layout(env):
         np.testing.assert_array_equal(spec.action_part(parts.action, i), actions[i])
     stacks = [np.stack([actions[i] for i in group.members]) for group in spec.groups]
     np.testing.assert_array_equal(spec.join_actions(stacks), joint[1])
+
+    # With n_step > 1 only one entry more, behind everything else.
+    assert parts.goes_on is None
+    several = dataclasses.replace(spec, n_step=3)
+    longer = several.pack_rows(joint[0], joint[1], reward, joint[2], jnp.asarray(terminated), jnp.asarray(truncated))
+    np.testing.assert_array_equal(longer[..., :-1], rows)
+    np.testing.assert_array_equal(several.row_parts(longer).goes_on, ~terminated & ~truncated)
+    np.testing.assert_array_equal(several.row_parts(longer).discount, 1.0 - terminated)
+    assert several.row_size == longer.shape[-1]
 
 
 @pytest.mark.parametrize("spec", [*map(spec_of, ENVIRONMENTS), interleaved()], ids=lambda s: "-".join(s.agents))

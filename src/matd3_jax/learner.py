@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from matd3_jax import networks, optimiser
+from matd3_jax import networks, optimiser, returns
 from matd3_jax.algorithms import HyperParams
 from matd3_jax.envs.base import ActionSpace
 from matd3_jax.spec import Group, Spec
@@ -49,9 +49,9 @@ class Minibatch(NamedTuple):
     inputs: chex.Array
     """[batch, critic inputs] what the critics read: x and a, or o_i and a_i."""
     reward: chex.Array
-    """[batch] r_i."""
+    """[batch] r_i; with n_step > 1 the sum of a return's discounted rewards."""
     discount: chex.Array
-    """[batch] 0 where the episode terminated, else 1."""
+    """[batch] 0 where the episode terminated, else 1; with n_step > 1 times gamma^(m - 1) after m steps."""
     next_observations: tuple[chex.Array, ...]
     """o' of those whose target actors the target needs, one array [agents, batch, observation size] per group."""
     next_x: chex.Array
@@ -126,7 +126,8 @@ def update(
 
     Args:
         state, hyper: one element per group.
-        rows: replay rows [num_agents, batch, row_size], a minibatch for each agent, or [1, batch, row_size] for all.
+        rows: replay rows [num_agents, batch, row_size], a minibatch for each agent, or [1, batch, row_size] for all;
+            with n_step > 1 [..., batch, n_step, row_size], see `returns.gather`.
         move: for each group whether this update moves actors and targets too (every policy_delay-th does).
         sequential: later agents see the earlier ones' moved target actors (the authors' program) instead of all
             learning from the same state.
@@ -135,7 +136,7 @@ def update(
     """
     mu_targets = [group.actor_target for group in state]
     keys = jax.random.split(key, len(spec.groups))
-    batches = [_minibatches(spec, group, rows) for group in spec.groups]
+    batches = [_minibatches(spec, group, rows, h.gamma) for group, h in zip(spec.groups, hyper, strict=True)]
     noises = [_noise(spec, group, rows.shape[:2], k) for group, k in zip(spec.groups, keys, strict=True)]
     new, metrics = list(state), jnp.full((3, spec.num_agents), jnp.nan)
 
@@ -257,13 +258,15 @@ def _target_actions(
     return spec.join_actions(parts) if group.algorithm.critic == "central" else parts[0]
 
 
-def _minibatches(spec: Spec, group: Group, rows: chex.Array) -> Minibatch:
+def _minibatches(spec: Spec, group: Group, rows: chex.Array, gamma: chex.Array | float) -> Minibatch:
     """The minibatches of a group's members, stacked."""
     shared = rows.shape[0] == 1
     central = group.algorithm.critic == "central"
 
     def one(i: int) -> Minibatch:
         parts = spec.row_parts(rows[0 if shared else i])
+        if spec.n_step > 1:
+            parts = returns.fold(parts, gamma)
         observation = spec.observation_part(parts.x, i)
         action = spec.action_part(parts.action, i)
         own_next = spec.observation_part(parts.next_x, i)

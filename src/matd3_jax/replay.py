@@ -5,6 +5,8 @@ for all of them, derived from the count of collects: a write is one contiguous s
 (under `vmap` it would turn into a scatter), and a batch is one gather.
 """
 
+from typing import NamedTuple
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -27,6 +29,32 @@ def write(rows: chex.Array, new: chex.Array, count: chex.Array) -> chex.Array:
 def filled(capacity: int, n: int, count: chex.Array | int) -> chex.Array:
     """Number of valid rows after `count` writes of n rows each."""
     return jnp.minimum(count, capacity // n) * n
+
+
+class Written(NamedTuple):
+    """What has been written: `count` collects of n rows each into `capacity` rows."""
+
+    capacity: int
+    n: int
+    count: chex.Array
+
+
+def successors(written: Written, indices: chex.Array, stride: int, steps: int) -> tuple[chex.Array, chex.Array]:
+    """Row numbers int32 [*indices.shape, steps] of each row and those after it in its environment, and whether they are
+    there [*indices.shape, steps]: what follows the newest row in the ring is the oldest one.
+
+    Args:
+        indices: numbers of rows that are there.
+        stride: rows from one of an environment to its next: a collect's rows are time-major [length, num_envs], and
+            the next collect follows.
+    """
+    capacity, n, count = written
+    size = filled(capacity, n, count)
+    # Modulo before the product, which overflows otherwise.
+    oldest = jnp.where(count < capacity // n, 0, count % (capacity // n) * n)
+    offsets = stride * jnp.arange(steps)
+    there = ((indices - oldest) % capacity)[..., None] + offsets < size
+    return (indices[..., None] + offsets) % capacity, there
 
 
 def sample_indices(key: chex.PRNGKey, size: chex.Array, shape: tuple[int, ...]) -> chex.Array:

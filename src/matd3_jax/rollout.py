@@ -79,7 +79,7 @@ def collect(
         action = spec.join_actions(draws) if random else act(spec, actors, hyper, carry.observation, draws)
         after = jax.vmap(env.step)(step_keys, carry.state, env_actions(spec, action))
         x, next_x = (jnp.concatenate(o, axis=-1) for o in (carry.observation, after.observation))
-        rows = spec.pack_rows(x, action, after.reward, next_x, after.terminated)
+        rows = spec.pack_rows(x, action, after.reward, next_x, after.terminated, after.truncated)
         returns = carry.episode_return + after.reward
         steps = carry.episode_step + 1
         ended = after.terminated | after.truncated

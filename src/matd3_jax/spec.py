@@ -28,6 +28,7 @@ class Spec:
 
     The joint observation x [observation_size] and the joint action [action_size] hold the agents' parts in the order
     of `agents`. A replay row is `x, actions, rewards, x', discount` with discount = 1 - terminated: [row_size] float32.
+    With n_step > 1 a last entry, goes_on, is 0 where the episode ended, for whatever reason.
     """
 
     agents: tuple[str, ...]
@@ -36,9 +37,11 @@ class Spec:
     action_spaces: tuple[ActionSpace, ...]
     algorithms: tuple[Algorithm, ...]
     """One per agent."""
+    n_step: int = 1
+    """Rewards in a target before it bootstraps (see `returns`)."""
 
     @classmethod
-    def of(cls, env: Environment, algorithms: Mapping[str, Algorithm]) -> "Spec":
+    def of(cls, env: Environment, algorithms: Mapping[str, Algorithm], n_step: int = 1) -> "Spec":
         """The spec of `env` with the algorithm of each team given by name."""
         return cls(
             agents=env.agents,
@@ -46,6 +49,7 @@ class Spec:
             observation_sizes=env.observation_sizes,
             action_spaces=env.action_spaces,
             algorithms=tuple(algorithms[team] for team in env.teams),
+            n_step=n_step,
         )
 
     @property
@@ -87,7 +91,7 @@ class Spec:
 
     @property
     def row_size(self) -> int:
-        return 2 * self.observation_size + self.action_size + self.num_agents + 1
+        return 2 * self.observation_size + self.action_size + self.num_agents + 1 + (self.n_step > 1)
 
     def pack_rows(
         self,
@@ -96,23 +100,28 @@ class Spec:
         reward: chex.Array,
         next_x: chex.Array,
         terminated: chex.Array,
+        truncated: chex.Array,
     ) -> chex.Array:
         """Replay rows [..., row_size] of x, next_x [..., observation_size], action [..., action_size],
-        reward [..., num_agents] and terminated [...]."""
-        discount = 1.0 - terminated.astype(jnp.float32)[..., None]
-        return jnp.concatenate([x, action, reward, next_x, discount], axis=-1, dtype=jnp.float32)
+        reward [..., num_agents], terminated and truncated [...]."""
+        parts = [x, action, reward, next_x, 1.0 - terminated.astype(jnp.float32)[..., None]]
+        if self.n_step > 1:
+            parts.append(1.0 - (terminated | truncated).astype(jnp.float32)[..., None])
+        return jnp.concatenate(parts, axis=-1, dtype=jnp.float32)
 
     def row_parts(self, rows: chex.Array) -> "RowParts":
         """The parts of rows [..., row_size]."""
         joint = self.observation_size + self.action_size
-        end = joint + self.num_agents
+        start = joint + self.num_agents
+        end = start + self.observation_size
         return RowParts(
             inputs=rows[..., :joint],
             x=rows[..., : self.observation_size],
             action=rows[..., self.observation_size : joint],
-            reward=rows[..., joint:end],
-            next_x=rows[..., end:-1],
-            discount=rows[..., -1],
+            reward=rows[..., joint:start],
+            next_x=rows[..., start:end],
+            discount=rows[..., end],
+            goes_on=rows[..., end + 1] if self.n_step > 1 else None,
         )
 
     # ---- joint vectors -----------------------------------------------------------------------------------------------
@@ -145,6 +154,8 @@ class RowParts:
     reward: chex.Array
     next_x: chex.Array
     discount: chex.Array
+    goes_on: chex.Array | None
+    """None with n_step = 1."""
 
 
 def _numbered(group: Group) -> list[tuple[int, int]]:

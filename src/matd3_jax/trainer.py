@@ -13,7 +13,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from matd3_jax import learner, replay, rollout
+from matd3_jax import learner, replay, returns, rollout
 from matd3_jax.algorithms import HyperParams
 from matd3_jax.envs.base import Environment
 from matd3_jax.learner import GroupState, UpdateMetrics
@@ -238,7 +238,7 @@ class Trainer:
             for u in range(unrolled):
                 index_key, update_key = jax.random.split(keys[u])
                 indices = replay.sample_indices(index_key, size, (batches, schedule.batch_size))
-                rows = replay.gather(state.replay, seed, indices)
+                rows = self.minibatches(state, seed, indices)
                 move = [(first + u + 1) % group.algorithm.policy_delay == 0 for group in groups]
                 states, m = learner.update(
                     self.spec, states, hyper, rows, update_key, move, schedule.sequential, one_by_one=self.on_cpu
@@ -263,6 +263,14 @@ class Trainer:
         # write, hang on the updates. A mean squared error is never negative; XLA does not know.
         wait = jnp.any(metrics.critic_loss < 0).astype(jnp.int32)
         return state._replace(groups=states, key=keys[:, 1], collects=state.collects + wait), metrics
+
+    def minibatches(self, state: TrainState, seed: chex.Array, indices: chex.Array) -> chex.Array:
+        """Rows [*indices.shape, row_size] of a local seed, or [*indices.shape, n_step, row_size]: what updates take."""
+        schedule = self.schedule
+        if self.spec.n_step == 1:
+            return replay.gather(state.replay, seed, indices)
+        written = replay.Written(schedule.replay_capacity, schedule.collect_steps, state.collects)
+        return returns.gather(self.spec, state.replay, seed, indices, written, schedule.num_envs)
 
     def cycle(self, state: TrainState, hyper) -> tuple[TrainState, Metrics]:
         episodes, metrics = [], []

@@ -59,7 +59,7 @@ class Training:
         for team in joint:
             base = JointTeam(base, (team,))
         self.env = base
-        self.spec = Spec.of(self.env, {team: algo.algorithm() for team, algo in teams.items()})
+        self.spec = Spec.of(self.env, {team: algo.algorithm() for team, algo in teams.items()}, config.n_step)
         schedule = Schedule(
             num_envs=config.num_envs,
             rollout_length=config.rollout_length,
@@ -94,7 +94,7 @@ class Training:
         return (
             f"replay: {t.rows} seeds x {t.schedule.replay_capacity:,} transitions x {s.row_size} numbers x 4 bytes "
             f"= {t.replay_bytes / 1e9:.2f} GB (x {s.observation_size}, actions {s.action_size}, "
-            f"rewards {s.num_agents}, x' {s.observation_size}, discount 1)"
+            f"rewards {s.num_agents}, x' {s.observation_size}, discount 1{', goes_on 1' if s.n_step > 1 else ''})"
         )
 
     def check_memory(self) -> None:

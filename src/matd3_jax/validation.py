@@ -25,7 +25,7 @@ def check(config: "Config") -> None:
             raise UserError(message)
 
     for key in ("total_steps", "seeds", "num_envs", "rollout_length", "updates_per_collect", "batch_size",
-                "replay_capacity", "learning_starts", "eval_episodes", "keep_checkpoints"):  # fmt: skip
+                "n_step", "replay_capacity", "learning_starts", "eval_episodes", "keep_checkpoints"):  # fmt: skip
         need(getattr(config, key) >= 1, f"{key}={getattr(config, key)}: must be at least 1")
     need(0 <= config.seed < 2**31, f"seed={config.seed}: must be between 0 and {2**31 - 1}")
     need(config.log_every is None or config.log_every >= 1, f"log_every={config.log_every}: must be positive")
@@ -51,6 +51,11 @@ def check(config: "Config") -> None:
         f"replay_capacity={config.replay_capacity} is not a multiple of the {collect} transitions of one collect "
         f"(num_envs={config.num_envs} x rollout_length={config.rollout_length}); "
         f"nearest: {max(1, round(config.replay_capacity / collect)) * collect}",
+    )
+    need(
+        config.n_step <= config.replay_capacity // config.num_envs,
+        f"n_step={config.n_step} is more than the {config.replay_capacity // config.num_envs} env steps that "
+        f"replay_capacity={config.replay_capacity} holds of each of num_envs={config.num_envs} environments",
     )
     need(
         config.total_steps >= config.learning_starts,

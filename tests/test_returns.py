@@ -1,0 +1,136 @@
+"""n-step returns from the replay against plain Python on the recorded play: several environments, ends of episodes of
+both kinds, collects, the ring's seam and its newest rows."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from ledger import HYPER, Ledger, by_hand
+
+from matd3_jax import learner, replay, returns
+from matd3_jax.algorithms import Algorithm
+from matd3_jax.spec import Spec
+from matd3_jax.trainer import Schedule, Trainer
+
+GAMMA = 0.7
+ENVS, LENGTH, CAPACITY = 3, 4, 60
+ALGORITHM = Algorithm(name="maddpg", hidden=(4,), num_critics=1, policy_delay=1)
+SCHEDULE = Schedule(num_envs=ENVS, rollout_length=LENGTH, batch_size=8, replay_capacity=CAPACITY, learning_starts=36)
+
+pytestmark = pytest.mark.usefixtures("quick_jit")
+
+
+def spec(n_step):
+    return Spec.of(Ledger(), {"agents": ALGORITHM, "adversaries": ALGORITHM}, n_step)
+
+
+def test_successors():
+    """Row numbers and existence against a ring of (environment, time) labels, through two and a half rounds."""
+    n = ENVS * LENGTH
+    successors = jax.jit(replay.successors, static_argnums=(2, 3))
+    ring, time = [None] * CAPACITY, 0
+    for count in range(1, 13):
+        for _ in range(LENGTH):
+            for e in range(ENVS):
+                ring[(time * ENVS + e) % CAPACITY] = (e, time)
+            time += 1
+        filled = [i for i, label in enumerate(ring) if label is not None]
+        written = replay.Written(CAPACITY, n, jnp.int32(count))
+        numbers, there = successors(written, jnp.array(filled), ENVS, 6)
+        for i, row, exists in zip(filled, np.asarray(numbers), np.asarray(there), strict=True):
+            e, t = ring[i]
+            assert exists.tolist() == [t + k < time for k in range(6)]
+            assert [ring[j] for j in row[exists]] == [(e, t + k) for k in range(6) if t + k < time]
+            assert ((row >= 0) & (row < CAPACITY)).all()
+
+
+def test_successors_far_on():
+    """After a billion collects (count * n overflows int32) the newest row of each environment still has none."""
+    count = 2**31 - 1
+    newest = (count - 1) % 5 * 12 + 11
+    _, there = replay.successors(replay.Written(60, 12, jnp.int32(count)), jnp.array([newest, newest - 3]), 3, 3)
+    assert there.tolist() == [[True, False, False], [True, True, False]]
+
+
+@functools.cache
+def play(collects):
+    """(trainer, state, rows in the order of play [steps, ENVS, row]) of two seeds after so many collects."""
+    hyper = {team: HYPER._replace(gamma=GAMMA) for team in ("agents", "adversaries")}
+    trainer = Trainer(Ledger(), spec(3), SCHEDULE, hyper, 2, devices=jax.devices()[:1])
+    state, _ = trainer.prefill(trainer.init(jax.vmap(jax.random.key)(jnp.arange(2))))
+    chunk, rows = trainer.chunk(1), [np.asarray(state.replay[:, : 2 * ENVS * LENGTH])]
+    while int(state.collects) < collects:
+        at = int(state.collects) * ENVS * LENGTH % CAPACITY
+        state, _ = chunk(state)
+        rows.append(np.asarray(state.replay[:, at : at + ENVS * LENGTH]))
+    played = np.concatenate(rows, axis=1).reshape(2, -1, ENVS, trainer.spec.row_size)
+    return trainer, state, played
+
+
+def by_python(rows, n):
+    """(rewards [2], x', discount, m) of the n-step return from the first of `rows`, all of one environment and after
+    it; ends of episodes by the rules of Ledger, not by what the rows say of them."""
+    total, discount = np.zeros(2), 1.0
+    for k, row in enumerate(rows[:n]):
+        x, action, _, _, _ = np.split(row, [7, 11, 13, 20])
+        reward, next_x, terminated, truncated = by_hand(x, action)
+        total += discount * reward
+        if terminated or truncated or k + 1 in (n, len(rows)):
+            return total, next_x, 0.0 if terminated else discount, k + 1
+        discount *= GAMMA
+    raise AssertionError
+
+
+# Two collects: the ring fills up; 5: just full; 8: round once and a half, the seam in the middle.
+@pytest.mark.parametrize("collects", [2, 5, 8])
+@pytest.mark.parametrize("n", [2, 3, 7])
+def test_returns_by_python(n, collects):
+    """For every row in the replay of both seeds: rewards, x' and the discount before gamma Q'. n = 7 is longer than an
+    episode and than a collect."""
+    trainer, state, played = play(collects)
+    steps = played.shape[1]
+
+    @jax.jit
+    def folded(seed, indices):
+        written = replay.Written(CAPACITY, SCHEDULE.collect_steps, state.collects)
+        rows = returns.gather(spec(n), state.replay, seed, indices, written, ENVS)
+        return rows, returns.fold(spec(n).row_parts(rows), GAMMA)
+
+    oldest = max(0, steps - CAPACITY // ENVS)
+    lengths, ends = set(), set()
+    for seed in range(2):
+        indices = [(t * ENVS + e) % CAPACITY for t in range(oldest, steps) for e in range(ENVS)]
+        rows, got = jax.tree.map(np.asarray, folded(seed, jnp.array(indices)))
+        assert rows.shape == (len(indices), n, trainer.spec.row_size)
+        for b, (t, e) in enumerate((t, e) for t in range(oldest, steps) for e in range(ENVS)):
+            reward, next_x, discount, m = by_python(played[seed, t:, e], n)
+            np.testing.assert_array_equal(got.inputs[b], played[seed, t, e, :11])
+            # float32: sums of at most 7 rewards of about 10, x' of one addition.
+            np.testing.assert_allclose(got.reward[b], reward, rtol=1e-5)
+            np.testing.assert_allclose(got.next_x[b], next_x, rtol=1e-6)
+            np.testing.assert_allclose(got.discount[b], discount, rtol=1e-6)
+            lengths.add(m)
+            ends.add("terminated" if discount == 0 else "newest" if t + m == steps else "cut" if m < n else "whole")
+    assert lengths >= set(range(1, min(n, 4) + 1))
+    assert ends >= {"terminated", "newest"} | ({"whole"} if n < 5 else {"cut"})
+
+
+def test_updates_get_them(monkeypatch):
+    """The loop's updates are given n_step rows for each transition drawn, and what `minibatches` gives is that."""
+    shapes, real = [], learner.update
+
+    def update(spec, state, hyper, rows, *args, **kwargs):
+        shapes.append(rows.shape)
+        return real(spec, state, hyper, rows, *args, **kwargs)
+
+    monkeypatch.setattr(learner, "update", update)
+    trainer, state, _ = play(8)
+    jax.eval_shape(trainer.chunk(1).jitted, state, trainer.hyper)
+    assert shapes == [(2, 8, 3, trainer.spec.row_size)]
+    indices = jnp.arange(CAPACITY).reshape(2, -1)
+    written = replay.Written(CAPACITY, SCHEDULE.collect_steps, state.collects)
+    np.testing.assert_array_equal(
+        trainer.minibatches(state, 1, indices), returns.gather(trainer.spec, state.replay, 1, indices, written, ENVS)
+    )
