@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import reference
 from learner_cases import layers
-from ledger import ENDS, HYPER, LIMIT, Ledger, by_hand
+from ledger import ENDS, LIMIT, Ledger, by_hand
 
 import matd3_jax
 from matd3_jax import rollout, training
@@ -32,9 +32,9 @@ def traced():
     """(result of a run with evaluations every 100 env steps, how often each kind of evaluation was compiled)."""
     count, real = collections.Counter(), rollout.evaluate
 
-    def evaluate(env, spec, actors, hyper, key, episodes, deterministic):
+    def evaluate(env, spec, policy, key, episodes, deterministic):
         count[episodes, deterministic] += 1
-        return real(env, spec, actors, hyper, key, episodes, deterministic)
+        return real(env, spec, policy, key, episodes, deterministic)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rollout, "evaluate", evaluate)
@@ -168,8 +168,8 @@ def test_stops_when_all_episodes_have_ended():
 
     result = run()
     env = Counting(episode_length=1000)
-    actors = [jax.tree.map(lambda leaf: leaf[0], g.actor) for g in result.state.groups]
-    found = rollout.evaluate(env, result.training.spec, actors, [HYPER, HYPER], jax.random.key(0), EPISODES, True)
+    policy = jax.tree.map(lambda leaf: leaf[0], result.training.trainer.policy(result.state))
+    found = rollout.evaluate(env, result.training.spec, policy, jax.random.key(0), EPISODES, True)
     jax.block_until_ready(found)
     jax.effects_barrier()
     assert found.length.max() == LIMIT
@@ -184,8 +184,8 @@ def test_cut_off_at_the_episode_length():
             return super().step(key, state, action)._replace(terminated=jnp.bool_(False), truncated=jnp.bool_(False))
 
     result = run()
-    actors = [jax.tree.map(lambda leaf: leaf[0], g.actor) for g in result.state.groups]
+    policy = jax.tree.map(lambda leaf: leaf[0], result.training.trainer.policy(result.state))
     env = Endless(episode_length=8)
-    found = rollout.evaluate(env, result.training.spec, actors, [HYPER, HYPER], jax.random.key(0), EPISODES, True)
+    found = rollout.evaluate(env, result.training.spec, policy, jax.random.key(0), EPISODES, True)
     np.testing.assert_array_equal(found.length, np.full(EPISODES, 8))
     np.testing.assert_allclose(found.measures[:, 1], 4.5)

@@ -16,8 +16,9 @@ from ledger import HYPER
 
 from matd3_jax.algorithms import Algorithm
 from matd3_jax.envs import Box, Environment, Simplex, TimeStep
+from matd3_jax.schedule import Schedule
 from matd3_jax.spec import Spec
-from matd3_jax.trainer import Schedule, Trainer
+from matd3_jax.trainer import Trainer
 
 GAMMA = 0.8
 ALGORITHMS = {

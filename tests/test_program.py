@@ -10,8 +10,9 @@ from ledger import HYPER
 
 from matd3_jax.algorithms import Algorithm
 from matd3_jax.envs import make
+from matd3_jax.schedule import Schedule
 from matd3_jax.spec import Spec
-from matd3_jax.trainer import Schedule, Trainer
+from matd3_jax.trainer import Trainer
 
 CAPACITY = 6 * 1361  # a number that nothing else in the program has
 IN_PLACE = {"parameter", "get-tuple-element", "tuple", "bitcast", "dynamic-update-slice", "while", "call"}

@@ -11,8 +11,9 @@ from ledger import HYPER, Ledger, by_hand
 
 from matd3_jax import learner, replay, returns
 from matd3_jax.algorithms import Algorithm
+from matd3_jax.schedule import Schedule
 from matd3_jax.spec import Spec
-from matd3_jax.trainer import Schedule, Trainer
+from matd3_jax.trainer import Trainer
 
 GAMMA = 0.7
 ENVS, LENGTH, CAPACITY = 3, 4, 60

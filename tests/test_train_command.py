@@ -4,6 +4,7 @@ import csv
 import importlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -134,6 +135,33 @@ def test_stopped_and_resumed_is_the_same_to_the_bit(whole, tmp_path, monkeypatch
     for name in ours:
         np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
     assert np.abs(ours["replay 2"]).max(axis=1).min() > 0 and len(ours["replay 2"]) == 500
+
+
+def test_several_steps_and_normalised_observations_resume_to_the_bit(tmp_path):
+    """With what these carry: ends of episodes in the replay, statistics in the state. `evaluate` plays with the saved
+    statistics: its numbers are those of the run's own last evaluation."""
+    settings = [
+        "env=point_reach", "algo=iddpg", "seeds=2", "algo.hidden=[8]", "batch_size=16", "learning_starts=100",
+        "total_steps=900", "log_every=100", "replay_capacity=500", "checkpoint_every=300", "keep_checkpoints=9",
+        "n_step=3", "normalise_observations=true",
+    ]  # fmt: skip
+    assert train.main([*settings, f"out={tmp_path}", "name=full"]) == 0
+    full = tmp_path / "full"
+    table, state = (full / "metrics.csv").read_bytes(), leaves(full)
+    assert sum("statistics" in name for name in state) == 2
+    first, *later = checkpoint.steps(full / "checkpoints")
+    for step in later:
+        shutil.rmtree(full / "checkpoints" / str(step))
+    assert train.main([f"resume={full}"]) == 0
+    assert first < later[-1] and (full / "metrics.csv").read_bytes() == table
+    for name, leaf in leaves(full).items():
+        np.testing.assert_array_equal(leaf, state[name], err_msg=name)
+    assert evaluate.main([f"run={full}", "episodes=10"]) == 0
+    with (full / "evaluation.csv").open(newline="") as file:
+        found = {(r["policy"], r["quantity"], r["seed"]): float(r["mean"]) for r in csv.DictReader(file)}
+    for row in rows(full)[-2:]:
+        got = found["deterministic", "return_agents", row["seed"]]
+        assert got == pytest.approx(float(row["eval_return_agents"]), rel=1e-6)  # nine digits in the table
 
 
 def test_a_finished_run_can_be_lengthened(tmp_path):

@@ -12,8 +12,9 @@ from ledger import ENDS, HYPER, LIMIT, Ledger, by_hand
 
 from matd3_jax import learner, rollout
 from matd3_jax.algorithms import Algorithm
+from matd3_jax.schedule import Schedule
 from matd3_jax.spec import Spec
-from matd3_jax.trainer import Schedule, Trainer
+from matd3_jax.trainer import Trainer
 
 MATD3 = Algorithm(hidden=(4,))
 MADDPG = Algorithm(name="maddpg", hidden=(4,), num_critics=1, policy_delay=1)
@@ -196,7 +197,7 @@ def stubbed_run(monkeypatch, trainer, state, cycles):
 def moves(monkeypatch, delays, updates):
     """(bits of two cycles, expected bits): nothing is played, only the schedule counts."""
 
-    def stay(env, spec, actors, hyper, env_state, key, length, **options):
+    def stay(env, spec, policy, env_state, key, length, **options):
         rows = jnp.zeros((length * env_state.episode_step.shape[0], spec.row_size))
         return env_state, rows, rollout.Episodes(jnp.int32(0), jnp.zeros(spec.num_agents), jnp.int32(0))
 

@@ -18,7 +18,7 @@ from matd3_jax.errors import UserError
 from matd3_jax.typed import plain, typed
 from matd3_jax.validation import check
 
-ADDED_LATER = {"eval_every": 0, "eval_episodes": 10, "n_step": 1}
+ADDED_LATER = {"eval_every": 0, "eval_episodes": 10, "n_step": 1, "normalise_observations": False}
 """Keys that runs from before them lack, with the values that those runs had in effect."""
 
 GROUPS = ("env", "algo", "adversary")
@@ -77,6 +77,7 @@ class Config:
     shared_minibatch: bool
     update_order: str
     n_step: int
+    normalise_observations: bool
     replay_capacity: int
     learning_starts: int
     warmup: str

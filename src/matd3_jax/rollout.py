@@ -7,10 +7,22 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from matd3_jax import learner, networks
+from matd3_jax import learner, networks, normalisation
 from matd3_jax.algorithms import HyperParams
 from matd3_jax.envs.base import Environment
+from matd3_jax.normalisation import Statistics
 from matd3_jax.spec import Spec
+
+
+class Policy(NamedTuple):
+    """All that acting takes, of one seed."""
+
+    actors: tuple[chex.ArrayTree, ...]
+    """Parameters, one stack per group."""
+    hyper: tuple[HyperParams, ...]
+    """One per group."""
+    statistics: Statistics | None
+    """What observations are normalised by; None: they are not."""
 
 
 class EnvState(NamedTuple):
@@ -53,8 +65,7 @@ def start(env: Environment, key: chex.PRNGKey, num_envs: int) -> EnvState:
 def collect(
     env: Environment,
     spec: Spec,
-    actors: Sequence[chex.ArrayTree],
-    hyper: Sequence[HyperParams],
+    policy: Policy,
     env_state: EnvState,
     key: chex.PRNGKey,
     length: int,
@@ -65,9 +76,7 @@ def collect(
     Returns the environments, the replay rows [length * num_envs, row_size] (the true next observation in them, also
     where an episode ended) and what ended on the way.
 
-    Args:
-        actors: actor parameters, one stack per group.
-        random: act uniformly at random instead: warm-up without the policies.
+    random: act uniformly at random instead: warm-up without the policies.
     """
     num_envs = env_state.episode_step.shape[0]
     noise_key, step_key, reset_key = jax.random.split(key, 3)
@@ -76,7 +85,7 @@ def collect(
 
     def step(carry: EnvState, inputs):
         draws, step_keys, fresh = inputs
-        action = spec.join_actions(draws) if random else act(spec, actors, hyper, carry.observation, draws)
+        action = spec.join_actions(draws) if random else act(spec, policy, carry.observation, draws)
         after = jax.vmap(env.step)(step_keys, carry.state, env_actions(spec, action))
         x, next_x = (jnp.concatenate(o, axis=-1) for o in (carry.observation, after.observation))
         rows = spec.pack_rows(x, action, after.reward, next_x, after.terminated, after.truncated)
@@ -104,8 +113,7 @@ def collect(
 def evaluate(
     env: Environment,
     spec: Spec,
-    actors: Sequence[chex.ArrayTree],
-    hyper: Sequence[HyperParams],
+    policy: Policy,
     key: chex.PRNGKey,
     episodes: int,
     deterministic: bool,
@@ -129,7 +137,7 @@ def evaluate(
         draws = None
         if not deterministic:
             draws = _noise(spec, act_key, (episodes,))
-        actions = env_actions(spec, act(spec, actors, hyper, env_state.observation, draws))
+        actions = env_actions(spec, act(spec, policy, env_state.observation, draws))
         after = jax.vmap(env.step)(jax.random.split(env_key, episodes), env_state.state, actions)
         measured += jnp.where(running[:, None], jax.vmap(env.measure)(after.state), 0)
         env_state = EnvState(
@@ -147,8 +155,7 @@ def evaluate(
 
 def act(
     spec: Spec,
-    actors: Sequence[chex.ArrayTree],
-    hyper: Sequence[HyperParams],
+    policy: Policy,
     observation: Sequence[chex.Array],
     draws: Sequence[chex.Array] | None,
 ) -> chex.Array:
@@ -156,12 +163,14 @@ def act(
 
     draws: noise [members, envs, action size] per group (see `networks.noise`); None: deterministic actions.
     """
-    parts = []
+    parts, statistics = [], policy.statistics
+    if statistics is not None:
+        observation = [normalisation.normalise_part(spec, statistics, o, i) for i, o in enumerate(observation)]
     for g, group in enumerate(spec.groups):
         stacked = jnp.stack([observation[i] for i in group.members])
-        output = learner.apply(learner.actor_of(group), actors[g], stacked)
+        output = learner.apply(learner.actor_of(group), policy.actors[g], stacked)
         draw = None if draws is None else draws[g]
-        parts.append(networks.act(group.action_space, output, draw, hyper[g].exploration_noise))
+        parts.append(networks.act(group.action_space, output, draw, policy.hyper[g].exploration_noise))
     return spec.join_actions(parts)
 
 

@@ -109,19 +109,24 @@ class Spec:
             parts.append(1.0 - (terminated | truncated).astype(jnp.float32)[..., None])
         return jnp.concatenate(parts, axis=-1, dtype=jnp.float32)
 
+    @property
+    def observation_columns(self) -> tuple[slice, slice]:
+        """Where x and x' stand in a row."""
+        start = self.observation_size + self.action_size + self.num_agents
+        return slice(0, self.observation_size), slice(start, start + self.observation_size)
+
     def row_parts(self, rows: chex.Array) -> "RowParts":
         """The parts of rows [..., row_size]."""
+        x, next_x = self.observation_columns
         joint = self.observation_size + self.action_size
-        start = joint + self.num_agents
-        end = start + self.observation_size
         return RowParts(
             inputs=rows[..., :joint],
-            x=rows[..., : self.observation_size],
+            x=rows[..., x],
             action=rows[..., self.observation_size : joint],
-            reward=rows[..., joint:start],
-            next_x=rows[..., start:end],
-            discount=rows[..., end],
-            goes_on=rows[..., end + 1] if self.n_step > 1 else None,
+            reward=rows[..., joint : next_x.start],
+            next_x=rows[..., next_x],
+            discount=rows[..., next_x.stop],
+            goes_on=rows[..., next_x.stop + 1] if self.n_step > 1 else None,
         )
 
     # ---- joint vectors -----------------------------------------------------------------------------------------------

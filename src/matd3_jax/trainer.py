@@ -1,6 +1,5 @@
 """The loop: rollout, replay and updates of many seeds inside one `lax.scan`, the seeds sharded over devices."""
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
@@ -13,47 +12,14 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from matd3_jax import learner, replay, returns, rollout
+from matd3_jax import learner, normalisation, replay, returns, rollout
 from matd3_jax.algorithms import HyperParams
 from matd3_jax.envs.base import Environment
 from matd3_jax.learner import GroupState, UpdateMetrics
-from matd3_jax.rollout import EnvState, Episodes, Evaluation
+from matd3_jax.normalisation import Statistics
+from matd3_jax.rollout import EnvState, Episodes, Evaluation, Policy
+from matd3_jax.schedule import Schedule
 from matd3_jax.spec import Spec
-
-
-@dataclasses.dataclass(frozen=True)
-class Schedule:
-    """How play and learning alternate: static.
-
-    Collect `num_envs * rollout_length` env steps, then `updates_per_collect` updates; actors and targets move with
-    every policy_delay-th update. The unit that the scan repeats (a cycle) is the shortest stretch of whole collects
-    that holds every algorithm's delay a whole number of times, so that the delay is structure and not a condition.
-    """
-
-    num_envs: int = 4
-    rollout_length: int = 25
-    updates_per_collect: int = 1
-    batch_size: int = 1024
-    replay_capacity: int = 1_000_000
-    """Transitions a seed; a multiple of `collect_steps`."""
-    learning_starts: int = 25_600
-    """Transitions in the replay at the first update."""
-    warmup: str = "policy"
-    """Before that, "policy": the untrained policies act; "random": uniform actions."""
-    shared_minibatch: bool = False
-    """One minibatch (and one set of target actions) for all agents instead of one each."""
-    sequential: bool = False
-    """Update the agents one after another (see `learner.update`)."""
-
-    @property
-    def collect_steps(self) -> int:
-        """Env steps of one collect."""
-        return self.num_envs * self.rollout_length
-
-    @property
-    def prefill_collects(self) -> int:
-        """Collects before the loop: the first collect of the loop then reaches `learning_starts`."""
-        return max(0, math.ceil(self.learning_starts / self.collect_steps) - 1)
 
 
 class TrainState(NamedTuple):
@@ -66,6 +32,8 @@ class TrainState(NamedTuple):
     key: chex.PRNGKey
     collects: chex.Array
     """int32 scalar: collects done, prefill included. Steps, updates and the replay's cursor follow from it."""
+    statistics: Statistics | None = None
+    """Of the observations collected; None where they are not normalised."""
 
 
 class Metrics(NamedTuple):
@@ -86,6 +54,8 @@ class Trainer:
         devices: where the seeds are spread out; default all devices, at most one a seed.
         piece: how many of a device's seeds are updated together; default 1 on CPU (a seed's batch stays in cache) and
             all of them elsewhere.
+        normalise_observations: networks see observations in units of their running mean and standard deviation; the
+            replay keeps them as they are.
     """
 
     def __init__(
@@ -97,8 +67,10 @@ class Trainer:
         num_seeds: int,
         devices: Sequence[jax.Device] | None = None,
         piece: int | None = None,
+        normalise_observations: bool = False,
     ):
         self.env, self.spec, self.schedule, self.num_seeds = env, spec, schedule, num_seeds
+        self.normalise_observations = normalise_observations
         updates = schedule.updates_per_collect
         for group in spec.groups:
             delay = group.algorithm.policy_delay
@@ -170,7 +142,7 @@ class Trainer:
     def shardings(self) -> TrainState:
         """Sharding of each field of the state (a prefix tree)."""
         seeds = NamedSharding(self.mesh, P("seeds"))
-        return TrainState(seeds, seeds, seeds, seeds, NamedSharding(self.mesh, P()))  # type: ignore[arg-type]
+        return self._fields(seeds, NamedSharding(self.mesh, P()))
 
     def _sharded(self, f: Callable, in_specs, out_specs) -> Callable:
         return jax.shard_map(f, mesh=self.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
@@ -197,25 +169,41 @@ class Trainer:
 
         def init(keys):
             groups, env, keys = jax.vmap(one)(keys)
-            return TrainState(groups, env, jnp.zeros((keys.shape[0], 0, 0)), keys, jnp.int32(0))
+            state = TrainState(groups, env, jnp.zeros((keys.shape[0], 0, 0)), keys, jnp.int32(0))
+            if not self.normalise_observations:
+                return state
+            fresh = normalisation.initial(self.spec.observation_size)
+            spread = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (keys.shape[0], *leaf.shape)), fresh)
+            return state._replace(statistics=spread)
 
         return jax.jit(self._sharded(init, P("seeds"), self._specs))
 
     @property
     def _specs(self) -> TrainState:
-        return TrainState(P("seeds"), P("seeds"), P("seeds"), P("seeds"), P())  # type: ignore[arg-type]
+        return self._fields(P("seeds"), P())
+
+    def _fields(self, seeds: Any, everywhere: Any) -> TrainState:
+        """A prefix tree of the state: what stands for leaves with and without the axis [seeds]."""
+        statistics = seeds if self.normalise_observations else None
+        return TrainState(seeds, seeds, seeds, seeds, everywhere, statistics)
+
+    def policy(self, state: TrainState, hyper: tuple[HyperParams, ...] | None = None) -> Policy:
+        """How each seed acts, leading axis [seeds]. hyper: of the seeds in `state`; default: of all."""
+        actors = tuple(group.actor for group in state.groups)
+        return Policy(actors, self.hyper if hyper is None else hyper, state.statistics)
 
     def collect(self, state: TrainState, hyper, random: bool = False) -> tuple[TrainState, Episodes]:
         """One collect of all local seeds."""
 
-        def one(groups, env, key, hyper):
-            actors = [group.actor for group in groups]
-            return rollout.collect(
-                self.env, self.spec, actors, hyper, env, key, self.schedule.rollout_length, random=random
-            )
+        def one(policy, env, key):
+            return rollout.collect(self.env, self.spec, policy, env, key, self.schedule.rollout_length, random=random)
 
         keys = jax.vmap(partial(jax.random.split, num=2))(state.key)
-        env, rows, episodes = jax.vmap(one)(state.groups, state.env, keys[:, 0], hyper)
+        env, rows, episodes = jax.vmap(one)(self.policy(state, hyper), state.env, keys[:, 0])
+        if state.statistics is not None:
+            x = self.spec.row_parts(rows).x
+            merge = jax.vmap(normalisation.merge, in_axes=(0, 0, None))
+            state = state._replace(statistics=merge(state.statistics, x, state.collects))
         rows = replay.write(state.replay, rows, state.collects)
         state = state._replace(env=env, replay=rows, key=keys[:, 1], collects=state.collects + 1)
         return state, episodes
@@ -265,12 +253,17 @@ class Trainer:
         return state._replace(groups=states, key=keys[:, 1], collects=state.collects + wait), metrics
 
     def minibatches(self, state: TrainState, seed: chex.Array, indices: chex.Array) -> chex.Array:
-        """Rows [*indices.shape, row_size] of a local seed, or [*indices.shape, n_step, row_size]: what updates take."""
+        """Rows [*indices.shape, row_size] of a local seed, or [*indices.shape, n_step, row_size], their observations
+        normalised: what updates take."""
         schedule = self.schedule
         if self.spec.n_step == 1:
-            return replay.gather(state.replay, seed, indices)
-        written = replay.Written(schedule.replay_capacity, schedule.collect_steps, state.collects)
-        return returns.gather(self.spec, state.replay, seed, indices, written, schedule.num_envs)
+            rows = replay.gather(state.replay, seed, indices)
+        else:
+            written = replay.Written(schedule.replay_capacity, schedule.collect_steps, state.collects)
+            rows = returns.gather(self.spec, state.replay, seed, indices, written, schedule.num_envs)
+        if state.statistics is None:
+            return rows
+        return normalisation.normalise_rows(self.spec, jax.tree.map(lambda s: s[seed], state.statistics), rows)
 
     def cycle(self, state: TrainState, hyper) -> tuple[TrainState, Metrics]:
         episodes, metrics = [], []
@@ -303,19 +296,18 @@ class Trainer:
         Args:
             keys: [num_seeds].
         """
-        found = self._evaluate(state.groups, self.hyper, self.fill(keys), episodes, deterministic)
+        found = self._evaluate(self.policy(state), self.fill(keys), episodes, deterministic)
         return jax.tree.map(lambda leaf: leaf[: self.num_seeds], found)
 
     @cached_property
     def _evaluate(self) -> Callable:
-        def evaluate(groups, hyper, keys, episodes, deterministic):
-            def one(groups, hyper, key):
-                actors = [group.actor for group in groups]
-                return rollout.evaluate(self.env, self.spec, actors, hyper, key, episodes, deterministic)
+        def evaluate(policy, keys, episodes, deterministic):
+            def one(policy, key):
+                return rollout.evaluate(self.env, self.spec, policy, key, episodes, deterministic)
 
-            return self._sharded(jax.vmap(one), P("seeds"), P("seeds"))(groups, hyper, keys)
+            return self._sharded(jax.vmap(one), P("seeds"), P("seeds"))(policy, keys)
 
-        return jax.jit(evaluate, static_argnums=(3, 4))
+        return jax.jit(evaluate, static_argnums=(2, 3))
 
 
 class Program(NamedTuple):

@@ -16,8 +16,9 @@ from matd3_jax.envs.base import Environment
 from matd3_jax.envs.joint import JointTeam
 from matd3_jax.errors import UserError
 from matd3_jax.rollout import Episodes, Evaluation
+from matd3_jax.schedule import Schedule
 from matd3_jax.spec import Spec
-from matd3_jax.trainer import Metrics, Program, Schedule, Trainer, TrainState
+from matd3_jax.trainer import Metrics, Program, Trainer, TrainState
 
 Row = dict[str, np.ndarray]
 """Columns of the metrics table for one chunk: each [seeds]; "step" and "seed" among them."""
@@ -72,7 +73,8 @@ class Training:
             sequential=config.update_order == "sequential",
         )
         hyper = {team: algo.hyper_params() for team, algo in teams.items()}
-        trainer = Trainer(self.env, self.spec, schedule, hyper, config.seeds)
+        normalise = config.normalise_observations
+        trainer = Trainer(self.env, self.spec, schedule, hyper, config.seeds, normalise_observations=normalise)
         # Whole chunks of equal length, so that one compiled program does for all; as many as come closest to log_every.
         cycles = max(1, math.ceil((config.total_steps - trainer.prefill_steps) / trainer.cycle_steps))
         wanted = max(1, round((config.log_every or config.total_steps / 100) / trainer.cycle_steps))
@@ -83,7 +85,7 @@ class Training:
         # Rows that would never be written are not allocated: the same result in less memory.
         capacity = min(config.replay_capacity, self.total_steps)
         schedule = dataclasses.replace(schedule, replay_capacity=capacity)
-        self.trainer = Trainer(self.env, self.spec, schedule, hyper, config.seeds)
+        self.trainer = Trainer(self.env, self.spec, schedule, hyper, config.seeds, normalise_observations=normalise)
 
     # ---- memory ------------------------------------------------------------------------------------------------------
 
