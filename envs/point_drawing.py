@@ -1,0 +1,31 @@
+"""point_reach as a scene on the plane."""
+
+import numpy as np
+
+from .base import OptionError
+from .colours import BLUE, GREEN, Colour
+from .plane import Disc, Scene
+from .point import PointReach, PointState
+
+RADIUS, TARGET_RADIUS = 0.06, 0.05
+"""Points have no size; their drawings have."""
+
+LEGEND: tuple[tuple[str, Colour], ...] = (("agent", BLUE), ("target", GREEN))
+
+
+def scene(env: PointReach, states: PointState) -> Scene:
+    """The episode of `states`, every leaf with a leading axis [frames]; a line is drawn as y = 0.
+
+    Raises OptionError for more than two dimensions.
+    """
+    if env.dim > 2:
+        raise OptionError(f"dim={env.dim}: only a line or a plane can be drawn")
+    pos, target = (_on_plane(np.asarray(place)) for place in (states.pos, states.target[0]))
+    discs = [Disc(target, TARGET_RADIUS, GREEN, ringed=True)]
+    discs += [Disc(pos[:, i], RADIUS, BLUE, label=str(i)) for i in range(env.num_agents)]
+    return Scene(discs)
+
+
+def _on_plane(place: np.ndarray) -> np.ndarray:
+    """[..., 2] from [..., dim]."""
+    return np.pad(place, [(0, 0)] * (place.ndim - 1) + [(0, 2 - place.shape[-1])])

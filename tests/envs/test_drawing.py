@@ -1,0 +1,199 @@
+"""Drawings in the plane: what is seen where, in which colour and how large, and that nothing leaves the picture."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from matd3_jax.envs import OptionError, make, plane, point_drawing
+from matd3_jax.envs.colours import BLUE, DARK_GREY, GREEN, GREY, PURPLE, VERMILION
+from matd3_jax.envs.particle import drawing
+from matd3_jax.envs.point import PointState
+
+SIDE = 300
+TASKS = (
+    "simple_spread", "simple_speaker_listener", "simple_crypto", "simple_push", "simple_adversary", "simple_tag",
+)  # fmt: skip
+
+
+def still(env, frames=1, **changes):
+    """A start state of a particle task with some fields changed, repeated."""
+    state, _ = env.reset(jax.random.key(0))
+    state = state._replace(**{name: jnp.asarray(value) for name, value in changes.items()})
+    return jax.tree.map(lambda leaf: jnp.stack([leaf] * frames), state)
+
+
+def draw(env, states):
+    return [np.asarray(image) for image in drawing.scene(env, states).images(SIDE)]
+
+
+def at(place, half=1.08, centre=(0.0, 0.0)):
+    """(row, column) of a place in the world, where the view is a square about `centre`."""
+    x, y = (np.asarray(place) - centre) / (2 * half)
+    return int((0.5 - y) * SIDE), int((0.5 + x) * SIDE)
+
+
+def close(pixels, colour, tolerance=60):
+    """Where pixels [..., 3] show a colour, an agent's transparency allowed for."""
+    return np.abs(np.asarray(pixels, int) - colour).max(axis=-1) < tolerance
+
+
+TAG = [[-0.6, 0.5], [0.6, 0.5], [0.0, -0.4], [0.2, 0.8]]
+
+
+def test_everything_is_where_it_is_and_in_its_colour():
+    """Three predators and a prey, y upwards; obstacles dark."""
+    image = draw(make("simple_tag"), still(make("simple_tag"), pos=TAG, landmark=[[-0.5, -0.6], [0.6, -0.5]]))[0]
+    assert image.shape == (SIDE, SIDE, 3) and image.dtype == np.uint8
+    for place, colour in zip(TAG, [VERMILION] * 3 + [BLUE], strict=True):
+        row, column = at(np.array(place) + [0, 0.035])  # above the number that stands in its middle
+        assert close(image[row, column], colour), (place, image[row, column])
+    for place in ([-0.5, -0.6], [0.6, -0.5]):
+        assert close(image[at(place)], DARK_GREY, 5)
+    assert close(image[at([0.5, 0.0])], (255, 255, 255), 25)
+
+
+@pytest.mark.parametrize(("name", "radius"), [("simple_spread", 0.15), ("simple_tag", 0.05)])
+def test_sizes_are_those_of_the_world(name, radius):
+    """An agent alone in the lower half is as wide and as high there as its diameter: more blue than red."""
+    env = make(name)
+    pos = [[-0.6, 0.5], [0.6, 0.5], [0.0, 0.3]][: len(env.agents) - 1] + [[0.1, -0.5]]
+    image = draw(env, still(env, pos=pos, landmark=np.full((len(env.world.landmark_radius), 2), 0.7)))[0]
+    lower = image[SIDE // 2 + 5 :].astype(int)
+    for places in np.nonzero(lower[..., 2] - lower[..., 0] > 40):
+        assert places.max() - places.min() + 1 == pytest.approx(2 * radius / 2.16 * SIDE, abs=2)
+
+
+def test_the_view_stays_and_holds_what_runs_away():
+    """One agent ends at (7, -3): it is in sight there, and a landmark is in the same place from first to last."""
+    env = make("simple_spread")
+    states = still(env, frames=3, landmark=[[0.5, 0.5], [-0.5, 0.5], [0, -0.5]])
+    path = jnp.array([[0.0, 0.0], [3.0, -1.0], [7.0, -3.0]])
+    states = states._replace(pos=states.pos.at[:, 0].set(path).at[:, 1:].set(jnp.array([[0.9, 0.9], [-0.9, 0.9]])))
+    images = draw(env, states)
+    half, centre = 1.08 * 8.15 / 2, (3.075, -1.075)  # from -1 to 7.15, and from -3.15 to 1
+    for image, place in zip(images, path, strict=True):
+        assert close(image[at(place, half, centre)], BLUE)
+        for landmark in ([0.5, 0.5], [-0.5, 0.5], [0, -0.5]):
+            assert close(image[at(landmark, half, centre)], GREY)
+    assert not close(images[2][at(path[0], half, centre)], BLUE)
+
+
+def test_nothing_shrinks_out_of_sight():
+    env = make("simple_tag")
+    states = still(env, pos=[[50.0, 0.0], *TAG[1:]])
+    image = draw(env, states)[0]
+    assert close(image, VERMILION).sum() > 30 and close(image, BLUE).sum() > 5
+
+
+def test_a_landmark_under_an_agent_stays_visible():
+    env = make("simple_spread")
+    image = draw(env, still(env, pos=[[0.5, 0.5], [-0.5, 0.5], [0.5, -0.5]], landmark=[[0.58, 0.5]] * 3))[0]
+    covered, free = image[at([0.58, 0.5])].astype(int), image[at([0.42, 0.5])].astype(int)
+    assert free[0] - covered[0] > 15 and covered[2] > covered[0] + 60  # darker, and still blue
+
+
+@pytest.mark.parametrize("name", ["simple_push", "simple_adversary", "simple_speaker_listener"])
+def test_the_goal_is_green(name):
+    env = make(name)
+    states = still(env, goal=1)
+    image = draw(env, states._replace(pos=states.pos * 0 + 0.9))[0]
+    half, centre = plane_of(env, states._replace(pos=states.pos * 0 + 0.9))
+    for i, place in enumerate(np.asarray(states.landmark[0])):
+        assert close(image[at(place, half, centre)], GREEN if i == 1 else GREY, 25)
+
+
+def plane_of(env, states):
+    centre, half = drawing.scene(env, states).view()
+    return half, centre
+
+
+def messages(env, comm, **changes):
+    pos = changes.pop("pos", np.linspace(-0.7, 0.7, 2 * len(env.agents)).reshape(-1, 2))
+    return draw(env, still(env, pos=pos, comm=comm, **changes))[0]
+
+
+def test_a_speaker_shows_each_entry_of_its_message():
+    env = make("simple_speaker_listener")
+
+    def purple(*said):
+        return close(messages(env, [said, [0.0] * 3]), PURPLE, 10).sum()
+
+    silent, half, one, all_ = purple(0, 0, 0), purple(0, 0.5, 0), purple(0, 1, 0), purple(1, 1, 1)
+    assert silent < half < one < all_
+    assert all_ - silent == pytest.approx(3 * (one - silent), rel=0.15)  # widths differ by a pixel
+    assert half - silent == pytest.approx((one - silent) / 2, rel=0.1)
+
+
+def test_silent_agents_show_no_message():
+    for name in ("simple_spread", "simple_push", "simple_adversary", "simple_tag"):
+        assert not close(draw(make(name), still(make(name)))[0], PURPLE, 10).any()
+
+
+@pytest.mark.parametrize("goal", [0, 1])
+def test_the_entry_for_the_goal_is_green_in_covert_communication(goal):
+    """Bob says the right code: green; Eve the other one: purple."""
+    env = make("simple_crypto")
+    right, wrong = np.eye(4)[goal], np.eye(4)[1 - goal]
+    alone = close(messages(env, [wrong, [0.0] * 4, [0.0] * 4], goal=goal), GREEN, 10).sum()
+    assert close(messages(env, [wrong, right, [0.0] * 4], goal=goal), GREEN, 10).sum() > 2 * alone
+
+
+@pytest.mark.parametrize("corner", [(1, 1), (-1, 1), (1, -1), (-1, -1), (0, 0)])
+def test_message_and_label_stay_in_sight(corner):
+    """The speaker in any corner: all of its message is seen, and as much black of its name as in the middle."""
+    env = make("simple_speaker_listener")
+    middle, there = (
+        messages(env, [[1.0] * 3, [0.0] * 3], pos=[place, (0.5, 0.5)])
+        for place in ((-0.5, 0.0), np.array(corner) * 1.0)
+    )
+    assert close(there, PURPLE, 10).sum() >= 0.97 * close(middle, PURPLE, 10).sum()
+    assert close(there, (0, 0, 0), 100).sum() == pytest.approx(close(middle, (0, 0, 0), 100).sum(), rel=0.2)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_every_task_is_drawn_and_explained(name):
+    """As many pictures as states, all different where all move; every colour of the legend is seen."""
+    env = make(name)
+    keys = jax.random.split(jax.random.key(1), 4)
+    state, _ = env.reset(keys[0])
+    states = [state]
+    for key in keys:
+        action = tuple(space.sample(key) for space in env.action_spaces)
+        states.append(env.step(key, states[-1], action).state)
+    images = draw(env, jax.tree.map(lambda *leaves: jnp.stack(leaves), *states))
+    assert len(images) == 5
+    assert all(np.any(a != b) for a, b in zip(images, images[1:], strict=False))
+    legend = drawing.legend(env)
+    assert [what for what, _ in legend][: len(set(env.teams))]
+    for what, colour in legend:
+        assert close(images[-1], colour).any(), what
+
+
+def point(env, pos, target):
+    state = PointState(jnp.array([pos]), jnp.zeros((1, *np.shape(pos))), jnp.array([target]), jnp.zeros(1, jnp.int32))
+    return np.asarray(next(point_drawing.scene(env, state).images(SIDE)))
+
+
+def test_point_masses_on_a_plane():
+    image = point(make("point_reach"), [[0.5, 0.5], [-0.5, 0.0]], [0.0, -0.7])
+    assert close(image[at([0.0, -0.7])], GREEN, 5)
+    for place in ([0.53, 0.5], [-0.47, 0.0]):
+        assert close(image[at(place)], BLUE)
+
+
+def test_point_masses_on_a_line_are_at_height_zero():
+    image = point(make("point_reach", dim=1), [[0.5], [-0.5]], [0.0])
+    assert close(image[at([0.0, 0.0])], GREEN, 5)
+    for place in ([0.53, 0.0], [-0.47, 0.0]):
+        assert close(image[at(place)], BLUE)
+    assert np.nonzero(close(image, BLUE))[0].mean() == pytest.approx(SIDE / 2, abs=2)
+
+
+def test_space_cannot_be_drawn():
+    with pytest.raises(OptionError, match="dim=3"):
+        point(make("point_reach", dim=3), [[0.0] * 3] * 2, [0.0] * 3)
+
+
+def test_the_typeface_is_there():
+    assert plane.font(12).getlength("step") > 10
