@@ -63,8 +63,9 @@ def _palette(frames: Sequence[Image.Image], colours: int) -> Image.Image:
     strip = Image.new("RGB", (width * len(picked), height))
     for k, frame in enumerate(picked):
         strip.paste(frame, (k * width, 0))
-    # Not by how often a colour occurs: an agent is small on a large background.
-    return strip.quantize(colours, method=Image.Quantize.MAXCOVERAGE)
+    # Not by how often a colour occurs: an agent is small on a large background. Then the means of what is nearest to
+    # each: white stays white.
+    return strip.quantize(colours, method=Image.Quantize.MAXCOVERAGE, kmeans=2)
 
 
 def _write_mp4(path: Path, frames: Sequence[Image.Image], fps: float) -> None:
