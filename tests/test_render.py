@@ -22,6 +22,7 @@ train = importlib.import_module("matd3_jax.train")  # the name in the package is
 TINY = [
     "env=simple_push", "adversary=maddpg", "seeds=3", "seed=5", "algo.hidden=[8]", "adversary.hidden=[8]",
     "batch_size=16", "num_envs=2", "learning_starts=200", "replay_capacity=500", "total_steps=1000", "eval_every=0",
+    "normalise_observations=true",
 ]  # fmt: skip
 
 

@@ -43,7 +43,7 @@ DEFAULTS: dict[str, Any] = {
 RANGES = {
     "seed": (0, math.inf),
     "checkpoint": (0, math.inf),
-    "episode": (0, math.inf),
+    "episode": (0, 9999),
     "max_steps": (1, math.inf),
     "every": (1, math.inf),
     "size": (100, 2000),

@@ -52,9 +52,9 @@ class RobotDrawing(Drawing):
         scene, option, perturb = mujoco.MjvScene(model, 10_000), mujoco.MjvOption(), mujoco.MjvPerturb()
         rect = mujoco.MjrRect(0, 0, width, height)
         context = self.new_context(width, height)
+        context.make_current()
+        renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         try:
-            context.make_current()
-            renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
             mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, renderer)
             for place, centre in zip(qpos, path, strict=True):
                 data.qpos[:] = place
@@ -66,8 +66,9 @@ class RobotDrawing(Drawing):
                 pixels = np.empty((height, width, 3), np.uint8)
                 mujoco.mjr_readPixels(pixels, None, rect, renderer)
                 yield Image.fromarray(pixels[::-1])
-            renderer.free()
         finally:
+            context.make_current()
+            renderer.free()
             context.free()
 
 
