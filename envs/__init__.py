@@ -41,6 +41,12 @@ _CLASSES = {
     "simple_adversary": (".particle.simple_adversary", "SimpleAdversary"),
     "simple_tag": (".particle.simple_tag", "SimpleTag"),
     "point_reach": (".point", "PointReach"),
+    "brax_ant": (".brax", "BraxAnt"),
+    "brax_half_cheetah": (".brax", "BraxHalfCheetah"),
+    "brax_hopper": (".brax", "BraxHopper"),
+    "brax_walker2d": (".brax", "BraxWalker2d"),
+    "brax_humanoid": (".brax", "BraxHumanoid"),
+    "brax_swimmer": (".brax", "BraxSwimmer"),
 }
 
 

@@ -16,15 +16,20 @@ OPTIONS = {
 """Compile three to five times faster; what is computed stays the same."""
 
 
-@pytest.fixture(scope="module")
-def quick_jit():
-    """`jax.jit` compiles with little optimisation within the module, where this XLA knows the options."""
-    patch, jit = pytest.MonkeyPatch(), jax.jit
+@pytest.fixture(scope="session")
+def quickly_compiled():
+    """`jax.jit` with little optimisation, where this XLA knows the options."""
     try:
-        jit(lambda x: x + 1, compiler_options=OPTIONS)(0)
+        jax.jit(lambda x: x + 1, compiler_options=OPTIONS)(0)
     except jax.errors.JaxRuntimeError:  # another backend or version: only slower
-        yield
-        return
-    patch.setattr(jax, "jit", functools.partial(jit, compiler_options=OPTIONS))
+        return jax.jit
+    return functools.partial(jax.jit, compiler_options=OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def quick_jit(quickly_compiled):
+    """`jax.jit` is `quickly_compiled` within the module: not for programs that themselves call `jax.jit`."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr(jax, "jit", quickly_compiled)
     yield
     patch.undo()

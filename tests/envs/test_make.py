@@ -25,7 +25,7 @@ def test_names_and_options():
     for name in names():
         defaults = options(name)
         assert make(name) == make(name, **defaults)
-        assert make(name).episode_length == 25
+        assert make(name).episode_length == defaults["episode_length"]
         assert make(name, episode_length=7) != make(name)
 
 
