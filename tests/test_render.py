@@ -77,6 +77,13 @@ def test_options_choose_the_frames(run, tmp_path, capsys):
     assert not (run / "short.gif").exists()
 
 
+def test_long_episodes_are_thinned_out(run, tmp_path, monkeypatch, capsys):
+    """25 steps with room for 9 pictures: every third, and the last."""
+    monkeypatch.setattr(render, "PICTURES", 9)
+    assert render.main([f"run={run}", f"out={tmp_path / 'a.gif'}", "size=100"]) == 0
+    assert "10 frames of episode 0" in capsys.readouterr().out
+
+
 BAD = {
     "no run": ([], "run=RUN_DIR"),
     "nowhere": (["run=nowhere"], "no run directory nowhere"),

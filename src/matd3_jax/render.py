@@ -22,7 +22,7 @@ so far.
   episode=0                which of the episodes that `evaluate` plays
   deterministic=true       false: with exploration noise, as in training
   max_steps=               stop after so many env steps; default: the whole episode
-  every=                   draw every n-th env step; default: the least that gives at most 200 pictures
+  every=                   draw every n-th env step; default: the least that makes some 200 at most
   size=400                 pixels of the longer side
   fps=                     pictures per second; default: 10, robots 20
 
@@ -51,7 +51,7 @@ RANGES = {
 }
 """Of what must be a whole number."""
 PICTURES = 200
-"""At most, unless `every` says otherwise."""
+"""At most, besides the start, unless `every` says otherwise."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -80,7 +80,7 @@ def main(argv: Sequence[str]) -> int:
         options["max_steps"],
         keep=drawing.select,
     )
-    shown = played.at(options["every"] or math.ceil(played.length / (PICTURES - 1)))
+    shown = played.at(options["every"] or math.ceil(played.length / PICTURES))
     frames = rendering.compose(drawing, shown.states, shown.captions(), options["size"])
     animation.write(out, frames, options["fps"] or drawing.fps)
     print(
