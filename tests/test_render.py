@@ -13,7 +13,8 @@ import pytest
 from PIL import Image, ImageSequence
 
 from matd3_jax import animation, checkpoint, config, episode, render, rendering
-from matd3_jax.envs import Box, Environment, TimeStep
+from matd3_jax.envs import Box, Environment, TimeStep, make
+from matd3_jax.envs.joint import JointTeam
 from matd3_jax.errors import UserError
 from matd3_jax.training import Training
 
@@ -193,6 +194,14 @@ def test_an_environment_that_draws_itself_and_terminates(own):
     red = [np.sum(np.asarray(frame)[30, :, 1] == 0) for frame in frames]
     width = frames[0].width
     assert red == [(7 - t) * width // 7 for t in range(8)]
+
+
+def test_a_joined_team_looks_like_the_task_it_joins():
+    env = make("simple_tag")
+    joined = JointTeam(env, "adversaries")
+    states = jax.tree.map(lambda leaf: leaf[None], joined.reset(jax.random.key(0))[0])
+    (one,), (other,) = rendering.frames(env, states, size=150), rendering.frames(joined, states, size=150)
+    np.testing.assert_array_equal(np.asarray(one), np.asarray(other))
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,8 @@ import types
 import numpy as np
 import pytest
 
-from matd3_jax import opengl, rendering, robot_drawing
+from matd3_jax import config, opengl, rendering, robot_drawing
+from matd3_jax.envs import make
 from matd3_jax.envs.colours import BLUE, VERMILION
 from matd3_jax.errors import UserError
 
@@ -156,3 +157,22 @@ def test_without_opengl_one_line_says_what_to_install(variables, wanted):
     assert done.returncode == 2, done.stderr
     assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1 and wanted in done.stderr
     assert done.stdout == ""
+
+
+@pytest.mark.parametrize("name", ["brax_ant", "brax_half_cheetah", "brax_humanoid"])
+def test_real_robots_show_every_agent(gl, name):
+    pytest.importorskip("brax")
+    env = make(name)
+    (image,) = draw(env, [env.mj_model.qpos0])
+    for agent in range(len(env.agents)):
+        assert hue(image, robot_drawing.agent_colour(agent)).sum() > 100, agent
+
+
+def test_an_opengl_that_mujoco_does_not_know_is_one_line_of_the_command(tmp_path):
+    """Here MuJoCo cannot even be imported, hence the environment not be made."""
+    pytest.importorskip("brax")
+    config.write(config.load(["env=brax_hopper"]), tmp_path / "config.yaml")
+    words = [sys.executable, "-m", "matd3_jax.render", f"run={tmp_path}"]
+    done = subprocess.run(words, env={**os.environ, "MUJOCO_GL": "vulkan"}, capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "vulkan" in done.stderr, done.stderr
+    assert done.stderr.startswith("error: ") and [p.name for p in tmp_path.iterdir()] == ["config.yaml"]
