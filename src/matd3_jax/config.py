@@ -21,8 +21,10 @@ from matd3_jax.validation import check
 ADDED_LATER = {"eval_every": 0, "eval_episodes": 10, "n_step": 1, "normalise_observations": False}
 """Keys that runs from before them lack, with the values that those runs had in effect."""
 
-GROUPS = ("env", "algo", "adversary")
+GROUPS = ("env", "algo", "adversary", "schedule")
 """Keys that choose a file; `adversary` takes the files of `algo`."""
+
+NOUNS = {"env": "environment", "algo": "algorithm", "adversary": "algorithm", "schedule": "schedule"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,14 +110,11 @@ def load(overrides: Sequence[str] = ()) -> Config:
     Raises UserError, naming the key and the nearest valid ones, for whatever is not known or not possible.
     """
     parsed = parse(overrides)
-    valid = known_names("algo")
-    for override in parsed:
-        if override.key_or_group in ("algo", "adversary") and override.value() not in valid:
-            raise UserError(f"no algorithm is called {override.value()!r}; {nearest(override.value(), valid)}")
-        if override.key_or_group == "env" and override.value() not in known_names("env"):
-            raise UserError(
-                f"no environment is called {override.value()!r}; {nearest(override.value(), known_names('env'))}"
-            )
+    for group, noun in NOUNS.items():
+        valid = known_names("algo" if group == "adversary" else group)
+        for value in (o.value() for o in parsed if o.key_or_group == group):
+            if value not in valid:
+                raise UserError(f"no {noun} is called {value!r}; {nearest(value, valid)}")
     # Files first: Hydra wants them chosen before their values are changed.
     chosen = [o for o in parsed if o.key_or_group in GROUPS]
     values = [o for o in parsed if o.key_or_group not in GROUPS]
@@ -131,13 +130,15 @@ def load(overrides: Sequence[str] = ()) -> Config:
         try:
             tree = compose("config", lines)
             _check_keys(tree, values)
+            if "robot" not in tree and any(line == "schedule=wide" for line in lines):
+                raise UserError(f"schedule=wide: is for robots; {tree.env.name} has the paper's only")
             tree = compose("config", lines + [_line(o) for o in values])
             resolved = OmegaConf.to_container(tree, resolve=True, throw_on_missing=True)
         except (HydraException, OmegaConfBaseException) as error:
             raise UserError(_one_line(error)) from error
     assert isinstance(resolved, dict)
-    for key in ("resume", "checkpoint"):  # the command's own, see train.py
-        resolved.pop(key)
+    for key in ("resume", "checkpoint", "robot"):  # the command's own, see train.py; what robots bring is in its place
+        resolved.pop(key, None)
     return from_dict(resolved)  # type: ignore[arg-type]
 
 

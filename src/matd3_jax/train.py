@@ -37,7 +37,7 @@ def main(argv: Sequence[str]) -> int:
     if {"-h", "--help"} & set(argv):
         settings = (Path(__file__).parent / "conf" / "config.yaml").read_text()
         names = {"envs": ", ".join(config.known_names("env")), "algos": ", ".join(config.known_names("algo"))}
-        print(HELP.format(settings=settings.split("_self_\n\n")[1], **names))
+        print(HELP.format(settings=settings.split("schedule: paper\n\n")[1], **names))
         return 0
     if "--cfg" in argv:
         print(config.text(config.load([a for a in argv if a != "--cfg"])), end="")
