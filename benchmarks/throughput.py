@@ -1,12 +1,14 @@
-"""`python -m benchmarks.throughput`: env steps/s and updates/s of rollout alone, update alone and the whole loop.
+"""`python -m benchmarks.throughput`: env steps/s and updates/s of the whole loop, and of each of its parts alone.
 
     python -m benchmarks.throughput [env=simple_spread] [seeds=[1,4,20]] [repeats=5] [out=FILE.json] [key=value ...]
 
 To compare machines, the rate of a matrix product of the loop's kind on all devices at once is measured first and last.
 
 Other keys are settings of the run, as `python -m matd3_jax.train` takes them. Every figure counts all seeds together
-and is the median of `repeats` stretches of about a second, with the slowest and the fastest beside it. "update alone"
-gives the env steps/s at which a loop with free rollouts would run.
+and is the median of `repeats` stretches of about a second, with the slowest and the fastest beside it. Parts:
+"environment" steps the environments with the same action again and again, "rollout" adds the policies and the write
+into the replay, "replay" gathers the minibatches, "update" is all that learning does, gathering included. The env
+steps/s of a part are those of a loop in which everything else is free.
 """
 
 import json
@@ -21,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from matd3_jax import command, config, devices
+from matd3_jax import command, config, devices, networks, replay
 from matd3_jax.errors import UserError
 from matd3_jax.trainer import Trainer, TrainState
 from matd3_jax.training import Training
@@ -46,13 +48,13 @@ def main(argv: Sequence[str]) -> int:
     for key in ("machine", "versions", "commit", "gflops_before"):
         print(f"{key}: {report[key]}")
     print(
-        f"{'seeds':>5} {'part':<10} {'env steps/s':>12} {'slowest':>10} {'fastest':>10} {'updates/s':>10}", flush=True
+        f"{'seeds':>5} {'part':<12} {'env steps/s':>12} {'slowest':>10} {'fastest':>10} {'updates/s':>10}", flush=True
     )
     rows = []
     for seeds in counts:
         for row in measure(overrides, seeds, options["repeats"], options["seconds"]):
             rows.append(row)
-            print(f"{row['seeds']:>5} {row['part']:<10} {row['env_steps_per_second']:>12,.0f} {row['slowest']:>10,.0f} "
+            print(f"{row['seeds']:>5} {row['part']:<12} {row['env_steps_per_second']:>12,.0f} {row['slowest']:>10,.0f} "
                   f"{row['fastest']:>10,.0f} {row['updates_per_second']:>10,.1f}"
                   f"   compiled in {row['compile_seconds']:.1f} s", flush=True)  # fmt: skip
     report["rows"] = rows
@@ -63,8 +65,10 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def measure(overrides: Sequence[str], seeds: int, repeats: int, seconds: float) -> list[dict[str, Any]]:
-    """Rows of the table for one number of seeds."""
+def measure(
+    overrides: Sequence[str], seeds: int, repeats: int, seconds: float, wanted: Sequence[str] | None = None
+) -> list[dict[str, Any]]:
+    """Rows of the table for one number of seeds; `wanted`: the parts to measure, default all."""
     # Replay no larger than a short run needs: its size does not change the work, only the memory.
     settings = config.load([f"seeds={seeds}", "total_steps=100000", "eval_every=0", *overrides])
     training = Training(settings)
@@ -73,11 +77,15 @@ def measure(overrides: Sequence[str], seeds: int, repeats: int, seconds: float) 
     state, _ = training.start()
     rows = []
     parts: dict[str, Callable[[TrainState, Any], Any]] = {
+        "environment": lambda s, h: _env_steps(trainer, s),
         "rollout": lambda s, h: _collects(trainer, s, h),
+        "replay": lambda s, h: _gathers(trainer, s, h),
         "update": lambda s, h: _updates(trainer, s, h),
         "loop": trainer.cycle,
     }
     for part, cycle in parts.items():
+        if wanted is not None and part not in wanted:
+            continue
         # Cycles in one call: first a guess, then as many as take the wanted time.
         cycles, compile_seconds = 2, None
         for attempt in range(2):
@@ -104,7 +112,7 @@ def measure(overrides: Sequence[str], seeds: int, repeats: int, seconds: float) 
                 "env_steps_per_second": steps / float(np.median(times)),
                 "slowest": steps / max(times),
                 "fastest": steps / min(times),
-                "updates_per_second": 0.0 if part == "rollout" else updates / float(np.median(times)),
+                "updates_per_second": updates / float(np.median(times)) if part in ("update", "loop") else 0.0,
                 "compile_seconds": compile_seconds,
             }
         )
@@ -135,6 +143,42 @@ def _collects(trainer: Trainer, state: TrainState, hyper: Any) -> tuple[TrainSta
     for _ in range(trainer.cycle_collects):
         state, episodes = trainer.collect(state, hyper)
     return state, episodes
+
+
+def _env_steps(trainer: Trainer, state: TrainState) -> tuple[TrainState, Any]:
+    """The env steps of one cycle and nothing else; no episode ends."""
+    spaces = trainer.spec.action_spaces
+    keys = jax.random.split(jax.random.key(0), (state.key.shape[0], trainer.schedule.num_envs))
+
+    def one(env_state, key):
+        action = tuple(networks.to_env(space, networks.random_action(key, space, ())) for space in spaces)
+        after = trainer.env.step(key, env_state, action)
+        return after.state, after.reward.sum() + sum(part.sum() for part in after.observation)
+
+    steps = trainer.cycle_collects * trainer.schedule.rollout_length
+    inner, sums = jax.lax.scan(lambda s, _: jax.vmap(jax.vmap(one))(s, keys), state.env.state, length=steps)
+    return state._replace(env=state.env._replace(state=inner)), sums.sum(axis=0)
+
+
+def _gathers(trainer: Trainer, state: TrainState, hyper: Any) -> tuple[TrainState, Any]:
+    """The minibatches of one cycle, read and summed."""
+    schedule = trainer.schedule
+    count = trainer.cycle_collects * schedule.updates_per_collect
+    batches = 1 if schedule.shared_minibatch else trainer.spec.num_agents
+    size = replay.filled(schedule.replay_capacity, schedule.collect_steps, state.collects)
+    keys = jax.vmap(lambda key: jax.random.split(key, count + 1))(state.key)
+
+    def one(args):
+        seed, keys, hyper = args
+
+        def gather(key):
+            indices = replay.sample_indices(key, size, (batches, schedule.batch_size))
+            return trainer.minibatches(state, hyper, seed, indices).sum()
+
+        return jax.lax.map(gather, keys)
+
+    sums = jax.lax.map(one, (jnp.arange(keys.shape[0]), keys[:, 1:], hyper))
+    return state._replace(key=keys[:, 0]), sums.sum(axis=1)
 
 
 def _updates(trainer: Trainer, state: TrainState, hyper: Any) -> tuple[TrainState, Any]:

@@ -12,6 +12,10 @@ import jax
 import jax.numpy as jnp
 
 
+LIMIT = 1e5
+"""Of a robot's positions (m, rad) and velocities (m/s, rad/s): nothing gets beyond but by blowing up numerically."""
+
+
 class OptionError(ValueError):
     """A name or an option that no environment takes; the message names the key, the value and what is allowed."""
 

@@ -10,12 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import brax_models as models
-from .base import Box, Environment, TimeStep, check_choice, check_count
+from .base import LIMIT, Box, Environment, TimeStep, check_choice, check_count
 from .mjx.partition import Partition, Split, as_split, partition
-
-LIMIT = 1e5
-"""Positions (m, rad) and velocities (m/s, rad/s) beyond it end the episode: nothing gets there but by blowing up."""
-
 
 class BraxState(NamedTuple):
     """State of one environment."""
@@ -45,7 +41,7 @@ class BraxRobot(Environment):
     hopper 11, walker2d 17, humanoid 244, swimmer 8.
 
     An episode terminates where brax says so (half_cheetah and swimmer never do) and, with reward 0, when the physics
-    blows up: an entry of the state is not finite or exceeds `LIMIT`. It is truncated after `episode_length` steps.
+    blows up: an entry of the state is not finite or exceeds `base.LIMIT`. It is truncated after `episode_length` steps.
 
     Measures: `forward_velocity` (m/s) and the parts of the reward, `reward_forward`, `reward_survive` (where there is
     one), `reward_ctrl`.

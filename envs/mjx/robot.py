@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from ..base import Box, Environment, TimeStep, check_choice, check_count
+from ..base import LIMIT, Box, Environment, TimeStep, check_choice, check_count
 from . import simulation
 from .partition import Layout, Partition, Split, as_split, describe, partition
 from .quietly import mjx
@@ -44,8 +44,8 @@ class Robot(Environment):
     """A robot of gymnasium's in MJX, its joints shared out among agents that all get the same reward.
 
     Options: `physics` "exact" or "fast" (`simulation.load`), `split` and `depth` (`partition.partition`),
-    `episode_length` in env steps. Actions are controls in the model's range. A state that is not finite terminates the
-    episode with reward 0.
+    `episode_length` in env steps. Actions are controls in the model's range. A state that blows up (an entry not finite
+    or beyond `base.LIMIT`) terminates the episode with reward 0.
 
     `measures`, means over env steps: forward_velocity (m/s), and the parts of the reward (reward_forward,
     reward_survive, reward_ctrl, reward_contact).
@@ -152,11 +152,11 @@ class Robot(Environment):
         data = self._physics.advance(
             state.qpos, state.qvel, state.qacc_warmstart, control, self.frame_skip, self.senses_contacts
         )
-        finite = jnp.isfinite(data.qpos).all() & jnp.isfinite(data.qvel).all()
-        healthy = finite & self.healthy(data.qpos, data.qvel)
+        sound = (jnp.abs(data.qpos) < LIMIT).all() & (jnp.abs(data.qvel) < LIMIT).all()  # false for NaN, too
+        healthy = sound & self.healthy(data.qpos, data.qvel)
         sensed, progress = self.sense(data), self.progress(data)
         speed = (progress - state.progress) / (self.frame_skip * self.mj_model.opt.timestep)
-        terms = jnp.where(finite, jnp.stack(self.rewards(speed, control, sensed, healthy)), 0)
+        terms = jnp.where(sound, jnp.stack(self.rewards(speed, control, sensed, healthy)), 0)
         after = RobotState(data.qpos, data.qvel, data.qacc_warmstart, sensed, progress, terms, state.step + 1)
         return TimeStep(
             state=after,
@@ -171,8 +171,8 @@ class Robot(Environment):
         return tuple(full[np.array(entries)] for entries in self.partition.observations)
 
     def full_observation(self, state: RobotState) -> chex.Array:
-        """What gymnasium shows a single agent: [full_observation_size]; zeros in place of what is not finite."""
-        return jnp.nan_to_num(self.raw_observation(state), nan=0.0, posinf=0.0, neginf=0.0)
+        """What gymnasium shows a single agent: [full_observation_size]; kept within `base.LIMIT`, 0 for NaN."""
+        return jnp.clip(jnp.nan_to_num(self.raw_observation(state), posinf=LIMIT, neginf=-LIMIT), -LIMIT, LIMIT)
 
     def raw_observation(self, state: RobotState) -> chex.Array:
         hidden = self.layout.qpos.count(None)

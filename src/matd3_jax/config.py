@@ -12,6 +12,7 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from matd3_jax import devices
 from matd3_jax.algorithms import Algorithm, HyperParams
 from matd3_jax.envs.base import nearest
 from matd3_jax.errors import UserError
@@ -23,6 +24,9 @@ ADDED_LATER = {"eval_every": 0, "eval_episodes": 10, "n_step": 1, "normalise_obs
 
 GROUPS = ("env", "algo", "adversary", "schedule")
 """Keys that choose a file; `adversary` takes the files of `algo`."""
+
+SCHEDULE = ("num_envs", "rollout_length", "updates_per_collect", "batch_size")
+"""Keys that a file of the group `schedule` sets."""
 
 NOUNS = {"env": "environment", "algo": "algorithm", "adversary": "algorithm", "schedule": "schedule"}
 
@@ -107,6 +111,8 @@ class Config:
 def load(overrides: Sequence[str] = ()) -> Config:
     """The configuration that overrides in Hydra's grammar (`env=simple_tag`, `algo.lr=0.003`) give.
 
+    Robots have the paper's schedule on a CPU and the wide one on an accelerator, unless one, or part of one, is given.
+
     Raises UserError, naming the key and the nearest valid ones, for whatever is not known or not possible.
     """
     parsed = parse(overrides)
@@ -130,8 +136,12 @@ def load(overrides: Sequence[str] = ()) -> Config:
         try:
             tree = compose("config", lines)
             _check_keys(tree, values)
-            if "robot" not in tree and any(line == "schedule=wide" for line in lines):
-                raise UserError(f"schedule=wide: is for robots; {tree.env.name} has the paper's only")
+            if "robot" not in tree and "schedule=wide" in lines:
+                raise UserError(f"schedule=wide is for robots; {tree.env.name} has the paper's only")
+            own = any(o.key_or_group in ("schedule", *SCHEDULE) for o in parsed)
+            if "robot" in tree and not own and devices.accelerated():
+                # One environment and minibatches of 100 would keep it waiting for the next kernel all the time.
+                lines.append("schedule=wide")
             tree = compose("config", lines + [_line(o) for o in values])
             resolved = OmegaConf.to_container(tree, resolve=True, throw_on_missing=True)
         except (HydraException, OmegaConfBaseException) as error:

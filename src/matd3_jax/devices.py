@@ -8,7 +8,10 @@ from pathlib import Path
 import jax
 import psutil
 
-PACKAGES = ("matd3_jax", "jax", "jaxlib", "flax", "optax", "chex", "orbax-checkpoint", "numpy")
+PACKAGES = (
+    *("matd3_jax", "jax", "jaxlib", "flax", "optax", "chex", "orbax-checkpoint", "numpy"),
+    *("mujoco", "mujoco-mjx", "gymnasium", "brax"),
+)
 
 
 def prepare() -> None:
@@ -33,6 +36,11 @@ def prepare() -> None:
         )
     except RuntimeError:
         pass
+
+
+def accelerated() -> bool:
+    """Whether JAX computes on something else than CPUs."""
+    return jax.default_backend() != "cpu"
 
 
 def versions() -> dict[str, str]:

@@ -20,14 +20,15 @@ from matd3_jax.statistics import mean_interval
 from matd3_jax.trainer import TrainState
 from matd3_jax.training import Training
 
-HELP = """usage: python -m matd3_jax.train [env=NAME] [algo=NAME] [adversary=NAME] [key=value ...]
+HELP = """usage: python -m matd3_jax.train [env=NAME] [algo=NAME] [adversary=NAME] [schedule=wide] [key=value ...]
        python -m matd3_jax.train resume=RUN_DIR [checkpoint=STEP] [total_steps=N]
        python -m matd3_jax.train --cfg [key=value ...]     print the resolved settings and stop
 
 environments: {envs}
 algorithms:   {algos}
 
-settings and their defaults (those of a file: env.KEY=value, algo.KEY=value, adversary.KEY=value):
+settings and their defaults (those of a file: env.KEY=value, algo.KEY=value, adversary.KEY=value); robots bring others
+along, which --cfg env=ant prints:
 
 {settings}"""
 
@@ -37,7 +38,7 @@ def main(argv: Sequence[str]) -> int:
     if {"-h", "--help"} & set(argv):
         settings = (Path(__file__).parent / "conf" / "config.yaml").read_text()
         names = {"envs": ", ".join(config.known_names("env")), "algos": ", ".join(config.known_names("algo"))}
-        print(HELP.format(settings=settings.split("schedule: paper\n\n")[1], **names))
+        print(HELP.format(settings=settings.split("\n\n", 2)[2], **names))
         return 0
     if "--cfg" in argv:
         print(config.text(config.load([a for a in argv if a != "--cfg"])), end="")
@@ -168,6 +169,8 @@ def _announce(training: Training, run: RunDirectory) -> None:
     print(f"run directory: {run.path}")
     print(f"{_title(training)}, seeds {settings.seed} to {settings.seed + settings.seeds - 1}, "
           f"{training.total_steps:,} env steps each, on {trainer.mesh.size} x {kinds}")  # fmt: skip
+    print(f"schedule: {settings.num_envs} x {settings.rollout_length} env steps, then {settings.updates_per_collect} "
+          f"updates with {settings.batch_size} transitions")  # fmt: skip
     print(training.memory, flush=True)
 
 

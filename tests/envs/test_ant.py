@@ -119,15 +119,16 @@ def test_free_runs_stay_with_c(ant, step, recorded):
         assert (np.quantile(error, [0.5, 0.9, 1]) < bounds.get(t + 1, np.inf)).all(), (t, error)
 
 
-def test_a_state_that_is_not_finite_ends_the_episode_harmlessly(ant, step, recorded):
+def test_a_state_that_blows_up_ends_the_episode_harmlessly(ant, step, recorded):
     qpos, qvel = recorded["qpos"][0, :-1].copy(), recorded["qvel"][0, :-1].copy()
     qvel[::2, 3] = np.nan
     qpos[1::4, 8] = np.inf
-    broken = ~(np.isfinite(qpos).all(axis=1) & np.isfinite(qvel).all(axis=1))
+    qvel[3::8, 6] = 1e9
+    broken = ~(np.isfinite(qpos).all(axis=1) & (np.abs(qvel) < 1e8).all(axis=1))
     after = step(states(ant, qpos, qvel, qpos[:, 0]), recorded["action"][0])
     np.testing.assert_array_equal(after.terminated, broken)
     assert (after.reward[broken] == 0).all()
-    assert all(np.isfinite(part).all() for part in after.observation)
+    assert all((np.abs(part) <= 1e5).all() for part in after.observation)
     assert (after.reward[~broken] != 0).all()
 
 

@@ -1,4 +1,4 @@
-"""Every robot beside gymnasium's version 5 of it, stepped by the installed C MuJoCo: single steps from visited states."""
+"""Every robot beside gymnasium's version 5 of it in the installed C MuJoCo: one step from each visited state."""
 
 import gymnasium
 import jax

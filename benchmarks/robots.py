@@ -1,0 +1,84 @@
+"""`python -m benchmarks.robots`: env steps/s of a robot alone and of the whole loop, over numbers of environments.
+
+    python -m benchmarks.robots [env=ant] [num_envs=[1,16,256,4096]] [seeds=2] [repeats=3] [seconds=2] [loops=true]
+                                [out=FILE.json] [key=value ...]
+
+Other keys are settings of the run. Environments are counted for each seed, rates over all seeds together; the seeds are
+spread over the devices (one for each CPU core), so `seeds` should be a multiple of them. Every row replays 100
+transitions for each env step, in minibatches of 100 with one environment and of about 1,000 with more: the paper's
+schedule and the wide one. Parts as in `benchmarks.throughput`. `loops=false`: the environment alone.
+"""
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks import throughput
+from matd3_jax import command, config, devices
+from matd3_jax.errors import UserError
+
+DEFAULTS: dict[str, Any] = {
+    "env": "ant",
+    "num_envs": [1, 16, 256, 4096],
+    "seeds": 2,
+    "repeats": 3,
+    "seconds": 2.0,
+    "loops": True,
+    "out": None,
+}
+
+
+def main(argv: Sequence[str]) -> int:
+    devices.prepare()
+    taken, overrides = config.take(argv, tuple(DEFAULTS))
+    options = {**DEFAULTS, **taken}
+    counts = options["num_envs"] if isinstance(options["num_envs"], list) else [options["num_envs"]]
+    if not all(type(n) is int and n >= 1 for n in counts):
+        raise UserError(f"num_envs={options['num_envs']!r}: must be whole numbers of at least 1")
+    report: dict[str, Any] = {
+        "machine": devices.description(),
+        "versions": devices.versions(),
+        "commit": throughput.commit(),
+        "settings": list(argv),
+        "gflops": throughput.matmul_gflops(),
+        "rows": [],
+    }
+    for key in ("machine", "versions", "commit", "gflops"):
+        print(f"{key}: {report[key]}")
+    print(f"{'environments':>12} {'part':<12} {'env steps/s':>12} {'slowest':>10} {'fastest':>10}", flush=True)
+    for n in counts:
+        parts = None if options["loops"] else ("environment",)
+        settings = [f"env={options['env']}", *schedule(n), *overrides]
+        rows = throughput.measure(settings, options["seeds"], options["repeats"], options["seconds"], parts)
+        for row in rows:
+            report["rows"].append({"num_envs": n, **row})
+            print(f"{n:>12} {row['part']:<12} {row['env_steps_per_second']:>12,.0f} {row['slowest']:>10,.0f} "
+                  f"{row['fastest']:>10,.0f}   compiled in {row['compile_seconds']:.0f} s", flush=True)  # fmt: skip
+    if options["out"] is not None:
+        Path(options["out"]).write_text(json.dumps(report, indent=1) + "\n")
+    return 0
+
+
+def schedule(num_envs: int) -> list[str]:
+    """Settings that replay 100 transitions for each env step with `num_envs` environments."""
+    if num_envs == 1:
+        updates, batch = 1, 100
+    else:
+        updates = max(2, 2 * round(num_envs / 20))
+        batch = round(100 * num_envs / updates)
+    steps = 1000 * num_envs  # a short run's replay: its size changes the memory, not the work
+    return [
+        f"num_envs={num_envs}",
+        f"updates_per_collect={updates}",
+        f"batch_size={batch}",
+        f"learning_starts={min(10_000, steps)}",
+        f"replay_capacity={steps}",
+        f"total_steps={steps}",
+    ]
+
+
+if __name__ == "__main__":
+    sys.argv[0] = "robots"
+    command.run(main)
