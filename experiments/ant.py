@@ -95,7 +95,7 @@ def report(out: Path, runs: Mapping[str, Path]) -> None:
     figure.savefig(out / "curves.png", dpi=130)
 
     lines = [
-        "| algorithm | seeds | env steps | last return: mean ± sd (95 % interval of the mean) | best | velocity (m/s) |",
+        "| algorithm | seeds | env steps | last return: mean ± sd (95 % interval of the mean) | best | velocity, m/s |",
         "|---|---|---|---|---|---|",
     ]
     for algo, table in tables.items():

@@ -11,8 +11,8 @@ ROBOTS = [
     for name in ("ant", "half_cheetah", "hopper", "walker2d", "humanoid", "swimmer")
 ]
 
-# tau, delay, smoothing, critics, whose critic, one agent in everybody's place: Ackermann et al. 2019, section 6.2 and
-# appendix; iddpg and ddpg as Lillicrap et al.'s algorithm with iltd3's and td3's settings.
+# tau, delay, smoothing, critics, whose critic, one agent in everybody's place: Ackermann et al. 2019, on decentralised
+# controllers of robots; iddpg and ddpg, not in the paper, with iltd3's and td3's settings.
 ALGORITHMS = {
     "matd3": (0.01, 2, 0.2, 2, "central", False),
     "maddpg": (0.01, 1, 0.0, 1, "central", False),

@@ -1,0 +1,52 @@
+"""Robots through the whole loop: shared rewards, evaluations with measures, single-agent baselines."""
+
+import numpy as np
+import pytest
+
+import matd3_jax
+from matd3_jax import config
+from matd3_jax.training import Training
+
+pytestmark = pytest.mark.usefixtures("quick_jit")
+
+SMALL = ("algo.hidden=[16]", "learning_starts=80", "replay_capacity=1000", "env.episode_length=20", "eval_episodes=2")
+
+
+def test_the_ant_trains_and_is_evaluated():
+    result = matd3_jax.train(
+        *SMALL, "env.physics=fast", env="ant", algo="matd3", schedule="wide",
+        seeds=2, total_steps=400, eval_every=200, log_every=200,
+    )  # fmt: skip
+    table = result.metrics
+    assert table["step"][0, -1] >= 400
+    # One reward for both agents, reported once.
+    np.testing.assert_array_equal(table["agent_0_return"], table["agent_1_return"])
+    np.testing.assert_allclose(table["return_agents"], table["agent_0_return"], rtol=1e-6)
+    there = ~np.isnan(table["eval_return_agents"])
+    assert there[:, 0].all() and there[:, -1].all()
+    terms = sum(table[f"eval_reward_{term}"][there] for term in ("forward", "survive", "ctrl", "contact"))
+    # Means over the env steps of an episode times its length: the return, if no episode is cut short by a fall.
+    whole = table["eval_episode_length"][there] == 20
+    assert whole.any()
+    np.testing.assert_allclose(20 * terms[whole], table["eval_return_agents"][there][whole], rtol=1e-4)
+    velocity, forward = (table[f"eval_{name}"][there] for name in ("forward_velocity", "reward_forward"))
+    np.testing.assert_allclose(velocity, forward)
+    assert np.isfinite(table["agent_0_critic_loss"][:, 1:]).all()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "observations", "actions"),
+    [
+        (["algo=matd3"], (59, 59), (4, 4)),
+        (["algo=td3"], (111,), (8,)),
+        (["algo=ddpg", "env.split=4x2"], (111,), (8,)),
+        (["algo=iltd3", "env.split=4x2", "env.depth=2"], (45,) * 4, (2,) * 4),
+        (["algo=maddpg", "env.split=single"], (111,), (8,)),
+        (["algo=matd3", "env.split=[[hip_1,hip_2,hip_3,hip_4],[ankle_1,ankle_2,ankle_3,ankle_4]]"], (71, 47), (4, 4)),
+    ],
+)
+def test_agents_see_what_their_split_says(overrides, observations, actions):
+    training = Training(config.load(["env=ant", *overrides]))
+    assert training.spec.observation_sizes == observations
+    assert tuple(space.size for space in training.spec.action_spaces) == actions
+    assert training.team_weights("agents").sum() == 1
