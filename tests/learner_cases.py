@@ -5,11 +5,12 @@ import functools
 from collections.abc import Mapping
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
 import reference
 
-from matd3_jax import config, learner
+from matd3_jax import config, learner, replay, returns
 from matd3_jax.envs import Box, Simplex, make
 from matd3_jax.envs.joint import JointTeam
 from matd3_jax.spec import Spec
@@ -144,15 +145,28 @@ def random_state(spec, rng):
 
 def random_rows(spec, rng, batches, batch=BATCH):
     """Replay rows [batches, batch, row_size], every other transition terminates; with n_step > 1 [batches, batch,
-    n_step, row_size], half of them the last of their episode or environment, and half of those terminate."""
+    n_step, row_size] in the order of play, half of them the last of an episode, and half of those terminate."""
     if spec.n_step == 1:
         rows = rng.normal(size=(batches, batch, spec.row_size))
         rows[..., -1] = np.arange(batch) % 2
         return rows
     rows = rng.normal(size=(batches, batch, spec.n_step, spec.row_size))
-    rows[..., -1] = rng.integers(0, 2, rows.shape[:-1])
-    rows[..., -2] = np.maximum(rows[..., -1], rng.integers(0, 2, rows.shape[:-1]))
+    more = rng.integers(0, 2, rows.shape[:-1])
+    rows[..., -2 - spec.observation_size] = more
+    rows[..., -1] = np.maximum(more, rng.integers(0, 2, rows.shape[:-1]))
     return rows
+
+
+def drawn(spec, rows, hyper):
+    """What `returns.draw` gives for such rows, put into a replay as those of batches * batch environments."""
+    if spec.n_step == 1:
+        return rows
+    batches, batch, n, size = rows.shape
+    num_envs = batches * batch
+    ring = jnp.moveaxis(rows, 2, 0).reshape(1, n * num_envs, size)
+    written = replay.Written(n * num_envs, n * num_envs, 1)
+    gamma = jnp.array([hyper[spec.place(i)[0]].gamma for i in range(spec.num_agents)])
+    return returns.draw(spec, ring, 0, jnp.arange(num_envs).reshape(batches, batch), written, num_envs, gamma)
 
 
 def layers(params, *place):

@@ -170,19 +170,20 @@ def take_apart(rows, agents):
     return parts[:n], parts[n : 2 * n], [r[:, 0] for r in parts[2 * n : 3 * n]], parts[3 * n : 4 * n], parts[-1][:, 0]
 
 
-def long_step(rows, reward, next_x, discount, goes_on, gamma):
-    """n-step returns of consecutive rows [batch, n, row]: the first rows with the discounted sum of rewards, x' of the
-    last row that counts and discount gamma^(m - 1) (1 - terminated) in their places.
-
-    reward, next_x: slices of a row; discount, goes_on: its columns.
-    """
+def long_step(rows, agents, gamma):
+    """n-step returns of consecutive rows [batch, n, row]: plain rows [batch, row - 1], of one step, with the discounted
+    sum of rewards, x' of the last row that counts, and discount gamma^(m - 1) (1 - terminated)."""
+    size = sum(agent.observation_size for agent in agents)
+    # x, actions, rewards, whether the episode goes on, x', discount
+    goes_on = rows.shape[2] - size - 2
+    reward, ending = slice(goes_on - len(agents), goes_on), slice(goes_on + 1, None)
     long = rows[:, 0].copy()
     for b, steps in enumerate(rows):
         m = next((k + 1 for k, row in enumerate(steps) if row[goes_on] == 0), len(steps))
         long[b, reward] = sum(gamma**k * steps[k, reward] for k in range(m))
-        long[b, next_x] = steps[m - 1, next_x]
-        long[b, discount] = gamma ** (m - 1) * steps[m - 1, discount]
-    return long
+        long[b, ending] = steps[m - 1, ending]
+        long[b, -1] *= gamma ** (m - 1)
+    return np.delete(long, goes_on, axis=1)
 
 
 def update(agents, batches, gumbel, normal, move, sequential):
@@ -200,9 +201,7 @@ def update(agents, batches, gumbel, normal, move, sequential):
         h, algorithm = agent.hyper, agent.algorithm
         rows = batches[i]
         if rows.ndim == 3:
-            n, size = len(agents), sum(other.observation_size for other in agents)
-            reward, next_x = slice(-2 - size - n, -2 - size), slice(-2 - size, -2)
-            rows = long_step(rows, reward, next_x, discount=-2, goes_on=-1, gamma=h.gamma)
+            rows = long_step(rows, agents, h.gamma)
         x, a, r, next_x, discount = take_apart(rows, agents)
         batch, central = len(batches[i]), algorithm.critic == "central"
 

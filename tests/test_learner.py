@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
-from learner_cases import BATCH, CASES, agents_of, numbers, random_rows, random_state
+from learner_cases import BATCH, CASES, agents_of, drawn, numbers, random_rows, random_state
 
 from matd3_jax import learner, networks
 
@@ -38,6 +38,7 @@ class Program:
 
         def update(state, rows):
             key, options = jax.random.key(0), {"sequential": case.sequential, "one_by_one": case.one_by_one}
+            rows = drawn(self.spec, rows, self.hyper)
             return learner.update(self.spec, state, self.hyper, rows, key, self.move, **options)
 
         self.jitted = jax.jit(update)

@@ -157,17 +157,20 @@ def test_updates_read_normalised_observations(n_step):
     _, state, states, _ = run()
     state = state._replace(statistics=state.statistics._replace(variance=state.statistics.variance / 20))
     t, plain = trainer(n_step), trainer(n_step, normalise=False)
-    if n_step > 1:  # rows of several steps end with one entry more
-        state = state._replace(replay=jnp.concatenate([state.replay, jnp.ones((*state.replay.shape[:2], 1))], axis=-1))
+    next_x = slice(18, 30)
+    if n_step > 1:  # one entry more, before x'
+        rows = jnp.split(state.replay, [18], axis=-1)
+        state = state._replace(replay=jnp.concatenate([rows[0], jnp.ones_like(rows[0][..., :1]), rows[1]], axis=-1))
+        next_x = slice(19, 31)
     indices = jnp.arange(CAPACITY).reshape(2, -1)
     columns = np.zeros(t.spec.row_size, bool)
-    columns[:12] = columns[18:30] = True
+    columns[:12] = columns[next_x] = True
     for seed in range(SEEDS):
-        got = np.asarray(jax.jit(t.minibatches)(state, seed, indices))
-        raw = np.asarray(plain.minibatches(state._replace(statistics=None), seed, indices))
+        got = np.asarray(jax.jit(t.minibatches)(state, [HYPER], seed, indices))
+        raw = np.asarray(plain.minibatches(state._replace(statistics=None), [HYPER], seed, indices))
         np.testing.assert_array_equal(got[..., ~columns], raw[..., ~columns])
         statistics = of_seed(in_numpy(state).statistics, seed)
-        for part in (slice(0, 12), slice(18, 30)):
+        for part in (slice(0, 12), next_x):
             want = by_numpy(statistics, raw[..., part])
             np.testing.assert_allclose(got[..., part], want, rtol=1e-5, atol=1e-5)
             assert 0 < (np.abs(want) == 10).mean() < 0.5

@@ -81,14 +81,19 @@ def test_layout(env):
     stacks = [np.stack([actions[i] for i in group.members]) for group in spec.groups]
     np.testing.assert_array_equal(spec.join_actions(stacks), joint[1])
 
-    # With n_step > 1 only one entry more, behind everything else.
-    assert parts.goes_on is None
+    # With n_step > 1 only one entry more, before x'.
+    assert parts.more is None
     several = dataclasses.replace(spec, n_step=3)
     longer = several.pack_rows(joint[0], joint[1], reward, joint[2], jnp.asarray(terminated), jnp.asarray(truncated))
-    np.testing.assert_array_equal(longer[..., :-1], rows)
-    np.testing.assert_array_equal(several.row_parts(longer).goes_on, ~terminated & ~truncated)
-    np.testing.assert_array_equal(several.row_parts(longer).discount, 1.0 - terminated)
+    plain = [*x, *actions, reward, (~terminated & ~truncated)[..., None], *next_x, 1.0 - terminated[..., None]]
+    np.testing.assert_array_equal(longer, np.concatenate(plain, axis=-1))
     assert several.row_size == longer.shape[-1]
+    parts_longer = several.row_parts(longer)
+    np.testing.assert_array_equal(parts_longer.more, ~terminated & ~truncated)
+    for name in ("x", "action", "inputs", "reward", "next_x", "discount"):
+        np.testing.assert_array_equal(getattr(parts_longer, name), getattr(parts, name))
+    for columns, want in zip(several.observation_columns, (joint[0], joint[2]), strict=True):
+        np.testing.assert_array_equal(longer[..., columns], want)
 
 
 @pytest.mark.parametrize("spec", [*map(spec_of, ENVIRONMENTS), interleaved()], ids=lambda s: "-".join(s.agents))

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from matd3_jax import networks, optimiser, returns
+from matd3_jax import networks, optimiser
 from matd3_jax.algorithms import HyperParams
 from matd3_jax.envs.base import ActionSpace
 from matd3_jax.spec import Group, Spec
@@ -49,9 +49,9 @@ class Minibatch(NamedTuple):
     inputs: chex.Array
     """[batch, critic inputs] what the critics read: x and a, or o_i and a_i."""
     reward: chex.Array
-    """[batch] r_i; with n_step > 1 the sum of a return's discounted rewards."""
+    """[batch] r_i; with n_step > 1 the return's sum of discounted rewards."""
     discount: chex.Array
-    """[batch] 0 where the episode terminated, else 1; with n_step > 1 times gamma^(m - 1) after m steps."""
+    """[batch] 0 where the episode terminated, else 1; with n_step > 1 times gamma^(m - 1)."""
     next_observations: tuple[chex.Array, ...]
     """o' of those whose target actors the target needs, one array [agents, batch, observation size] per group."""
     next_x: chex.Array
@@ -127,7 +127,7 @@ def update(
     Args:
         state, hyper: one element per group.
         rows: replay rows [num_agents, batch, row_size], a minibatch for each agent, or [1, batch, row_size] for all;
-            with n_step > 1 [..., batch, n_step, row_size], see `returns.gather`.
+            with n_step > 1 as `returns.draw` gives them.
         move: for each group whether this update moves actors and targets too (every policy_delay-th does).
         sequential: later agents see the earlier ones' moved target actors (the authors' program) instead of all
             learning from the same state.
@@ -265,8 +265,6 @@ def _minibatches(spec: Spec, group: Group, rows: chex.Array, gamma: chex.Array |
 
     def one(i: int) -> Minibatch:
         parts = spec.row_parts(rows[0 if shared else i])
-        if spec.n_step > 1:
-            parts = returns.fold(parts, gamma)
         observation = spec.observation_part(parts.x, i)
         action = spec.action_part(parts.action, i)
         own_next = spec.observation_part(parts.next_x, i)
@@ -279,7 +277,7 @@ def _minibatches(spec: Spec, group: Group, rows: chex.Array, gamma: chex.Array |
             action=action,
             inputs=parts.inputs if central else jnp.concatenate([observation, action], axis=-1),
             reward=parts.reward[..., i],
-            discount=parts.discount,
+            discount=parts.discount if parts.more is None else parts.discount * gamma**parts.more,
             next_observations=every_next if central else (own_next,),
             next_x=parts.next_x if central else own_next,
             action_column=jnp.int32(column),

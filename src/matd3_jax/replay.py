@@ -62,6 +62,6 @@ def sample_indices(key: chex.PRNGKey, size: chex.Array, shape: tuple[int, ...]) 
     return jax.random.randint(key, shape, 0, size)
 
 
-def gather(rows: chex.Array, seed: chex.Array, indices: chex.Array) -> chex.Array:
-    """The rows [*indices.shape, row_size] of one seed."""
-    return rows.at[seed, indices].get(mode="promise_in_bounds")
+def gather(rows: chex.Array, seed: chex.Array | int, indices: chex.Array, columns: slice = slice(None)) -> chex.Array:
+    """The rows [*indices.shape, row_size] of one seed, or a part of them."""
+    return rows.at[seed, indices, columns].get(mode="promise_in_bounds")

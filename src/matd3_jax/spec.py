@@ -28,7 +28,7 @@ class Spec:
 
     The joint observation x [observation_size] and the joint action [action_size] hold the agents' parts in the order
     of `agents`. A replay row is `x, actions, rewards, x', discount` with discount = 1 - terminated: [row_size] float32.
-    With n_step > 1 a last entry, goes_on, is 0 where the episode ended, for whatever reason.
+    With n_step > 1 an entry `more` stands between rewards and x': 0 where the episode ended, either way, or 1.
     """
 
     agents: tuple[str, ...]
@@ -104,29 +104,28 @@ class Spec:
     ) -> chex.Array:
         """Replay rows [..., row_size] of x, next_x [..., observation_size], action [..., action_size],
         reward [..., num_agents], terminated and truncated [...]."""
-        parts = [x, action, reward, next_x, 1.0 - terminated.astype(jnp.float32)[..., None]]
-        if self.n_step > 1:
-            parts.append(1.0 - (terminated | truncated).astype(jnp.float32)[..., None])
-        return jnp.concatenate(parts, axis=-1, dtype=jnp.float32)
+        more = [1.0 - (terminated | truncated).astype(jnp.float32)[..., None]] if self.n_step > 1 else []
+        discount = 1.0 - terminated.astype(jnp.float32)[..., None]
+        return jnp.concatenate([x, action, reward, *more, next_x, discount], axis=-1, dtype=jnp.float32)
 
     @property
     def observation_columns(self) -> tuple[slice, slice]:
         """Where x and x' stand in a row."""
-        start = self.observation_size + self.action_size + self.num_agents
-        return slice(0, self.observation_size), slice(start, start + self.observation_size)
+        return slice(0, self.observation_size), slice(-1 - self.observation_size, -1)
 
     def row_parts(self, rows: chex.Array) -> "RowParts":
         """The parts of rows [..., row_size]."""
         x, next_x = self.observation_columns
         joint = self.observation_size + self.action_size
+        end = joint + self.num_agents
         return RowParts(
             inputs=rows[..., :joint],
             x=rows[..., x],
             action=rows[..., self.observation_size : joint],
-            reward=rows[..., joint : next_x.start],
+            reward=rows[..., joint:end],
+            more=rows[..., end] if self.n_step > 1 else None,
             next_x=rows[..., next_x],
-            discount=rows[..., next_x.stop],
-            goes_on=rows[..., next_x.stop + 1] if self.n_step > 1 else None,
+            discount=rows[..., -1],
         )
 
     # ---- joint vectors -----------------------------------------------------------------------------------------------
@@ -157,10 +156,11 @@ class RowParts:
     x: chex.Array
     action: chex.Array
     reward: chex.Array
+    more: chex.Array | None
+    """Whether the episode goes on; in rows that `returns.draw` gives, how many steps of a return follow the first. None
+    with n_step = 1."""
     next_x: chex.Array
     discount: chex.Array
-    goes_on: chex.Array | None
-    """None with n_step = 1."""
 
 
 def _numbered(group: Group) -> list[tuple[int, int]]:

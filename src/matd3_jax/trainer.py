@@ -226,7 +226,7 @@ class Trainer:
             for u in range(unrolled):
                 index_key, update_key = jax.random.split(keys[u])
                 indices = replay.sample_indices(index_key, size, (batches, schedule.batch_size))
-                rows = self.minibatches(state, seed, indices)
+                rows = self.minibatches(state, hyper, seed, indices)
                 move = [(first + u + 1) % group.algorithm.policy_delay == 0 for group in groups]
                 states, m = learner.update(
                     self.spec, states, hyper, rows, update_key, move, schedule.sequential, one_by_one=self.on_cpu
@@ -252,15 +252,18 @@ class Trainer:
         wait = jnp.any(metrics.critic_loss < 0).astype(jnp.int32)
         return state._replace(groups=states, key=keys[:, 1], collects=state.collects + wait), metrics
 
-    def minibatches(self, state: TrainState, seed: chex.Array, indices: chex.Array) -> chex.Array:
-        """Rows [*indices.shape, row_size] of a local seed, or [*indices.shape, n_step, row_size], their observations
-        normalised: what updates take."""
-        schedule = self.schedule
-        if self.spec.n_step == 1:
+    def minibatches(
+        self, state: TrainState, hyper: Sequence[HyperParams], seed: chex.Array | int, indices: chex.Array
+    ) -> chex.Array:
+        """What updates take: the rows [*indices.shape, row_size] of a local seed and its `hyper`, rewards of n_step
+        steps in them, observations normalised."""
+        schedule, spec = self.schedule, self.spec
+        if spec.n_step == 1:
             rows = replay.gather(state.replay, seed, indices)
         else:
             written = replay.Written(schedule.replay_capacity, schedule.collect_steps, state.collects)
-            rows = returns.gather(self.spec, state.replay, seed, indices, written, schedule.num_envs)
+            gamma = jnp.stack([jnp.asarray(hyper[spec.place(i)[0]].gamma) for i in range(spec.num_agents)])
+            rows = returns.draw(spec, state.replay, seed, indices, written, schedule.num_envs, gamma)
         if state.statistics is None:
             return rows
         return normalisation.normalise_rows(self.spec, jax.tree.map(lambda s: s[seed], state.statistics), rows)

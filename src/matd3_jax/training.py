@@ -96,7 +96,7 @@ class Training:
         return (
             f"replay: {t.rows} seeds x {t.schedule.replay_capacity:,} transitions x {s.row_size} numbers x 4 bytes "
             f"= {t.replay_bytes / 1e9:.2f} GB (x {s.observation_size}, actions {s.action_size}, "
-            f"rewards {s.num_agents}, x' {s.observation_size}, discount 1{', goes_on 1' if s.n_step > 1 else ''})"
+            f"rewards {s.num_agents}, {'more 1, ' if s.n_step > 1 else ''}x' {s.observation_size}, discount 1)"
         )
 
     def check_memory(self) -> None:
