@@ -11,7 +11,6 @@ import chex
 import jax
 import jax.numpy as jnp
 
-
 LIMIT = 1e5
 """Of a robot's positions (m, rad) and velocities (m/s, rad/s): nothing gets beyond but by blowing up numerically."""
 

@@ -13,6 +13,7 @@ from . import brax_models as models
 from .base import LIMIT, Box, Environment, TimeStep, check_choice, check_count
 from .mjx.partition import Partition, Split, as_split, partition
 
+
 class BraxState(NamedTuple):
     """State of one environment."""
 

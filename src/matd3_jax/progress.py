@@ -84,6 +84,9 @@ class ProgressBar:
 
 
 def _spread(values: np.ndarray) -> str:
+    values = values[~np.isnan(values)]
+    if not len(values):
+        return "-"  # no episode ended
     return f"{values.mean():.1f}" + (f" ± {values.std(ddof=1):.1f}" if len(values) > 1 else "")
 
 

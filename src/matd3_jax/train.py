@@ -186,12 +186,14 @@ def _name(settings: Config) -> str:
 
 
 def _finals(metrics: dict[str, np.ndarray]) -> dict[str, tuple[float, float | None]]:
-    """For each team `_final` of the mean training return in the last tenth of the run."""
+    """For each team `_final` of the mean training return in the last tenth of the run, if all seeds ended episodes."""
     late = metrics["step"] > 0.9 * metrics["step"].max()
     finals = {}
     for name in (name for name in metrics if name.startswith("return_")):
-        by_seed = [np.nanmean(metrics[name][late & (metrics["seed"] == s)]) for s in np.unique(metrics["seed"])]
-        finals[name.removeprefix("return_")] = _final(np.array(by_seed))
+        there = late & ~np.isnan(metrics[name])  # long episodes need not end within a chunk
+        seeds = [metrics[name][there & (metrics["seed"] == s)] for s in np.unique(metrics["seed"])]
+        if all(values.size for values in seeds):
+            finals[name.removeprefix("return_")] = _final(np.array([values.mean() for values in seeds]))
     return finals
 
 

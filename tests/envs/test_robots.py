@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from matd3_jax.envs import make
+from matd3_jax.envs.quiet import quiet_compiler
 
 pytestmark = [
     pytest.mark.usefixtures("quick_jit"),
@@ -25,6 +26,12 @@ IDS = {
 BATCH = 120
 
 
+def theirs(name):
+    """gymnasium's environment, without the compiler's warnings, which it would log in the working directory."""
+    with quiet_compiler():
+        return gymnasium.make(IDS[name]).unwrapped
+
+
 def progress(name, model, data):
     """What the forward reward is the speed of, as the data have it."""
     if name == "ant":
@@ -34,7 +41,7 @@ def progress(name, model, data):
 
 def play(name):
     """Columns [BATCH, ...] of steps that gymnasium makes: state before, action, and what came of it."""
-    env = gymnasium.make(IDS[name]).unwrapped
+    env = theirs(name)
     model, data = env.model, env.data
     model.geom_margin /= 2  # as MuJoCo had margins before 3.5.0; here and in our model
     if name == "humanoid":
@@ -93,8 +100,8 @@ def test_steps_are_those_of_gymnasium(name):
 
 @pytest.mark.parametrize("name", IDS)
 def test_reset_is_gymnasiums(name):
-    env, theirs = make(name, split="single"), gymnasium.make(IDS[name]).unwrapped
-    wanted = np.stack([theirs.reset(seed=seed)[0] for seed in range(300)])
+    env, other = make(name, split="single"), theirs(name)
+    wanted = np.stack([other.reset(seed=seed)[0] for seed in range(300)])
     if name == "ant":
         wanted = np.insert(wanted, [27] * 6, 0.0, axis=1)
     if env.mj_model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE:
