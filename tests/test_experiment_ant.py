@@ -1,0 +1,67 @@
+"""The report of `experiments.ant`: what it says of given runs."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from experiments import ant
+from matd3_jax import config
+from matd3_jax.errors import UserError
+from matd3_jax.runs import RunDirectory
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """Two seeds of MATD3, evaluated at 0, 20 and 40 env steps, and a finished run of TD3."""
+    folder = tmp_path / "runs"
+    for algo, level in {"matd3": 0.0, "td3": 500.0}.items():
+        settings = config.load(["env=ant", f"algo={algo}", "seeds=2"])
+        run = RunDirectory.create(folder / algo, settings, {"cores": 2})
+        for step in (0, 10, 20, 30, 40):
+            there = step % 20 == 0
+            returns = np.array([1.0, 3.0]) * step + level
+            run.append(
+                {
+                    "step": np.full(2, step),
+                    "seed": np.arange(2),
+                    "updates": np.full(2, step // 10),
+                    "return_agents": np.zeros(2),
+                    "eval_return_agents": returns if there else np.full(2, np.nan),
+                    "eval_forward_velocity": returns / 100 if there else np.full(2, np.nan),
+                }
+            )
+    run.write_summary({"total_steps": 40})
+    return folder
+
+
+def test_report(runs, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert ant.main(["algos=[matd3,td3,iltd3]", "train=false", f"runs={runs}", f"out={out}"]) == 0
+    with (out / "curves.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    found = {(row["algo"], int(row["seed"]), int(row["step"])): float(row["eval_return_agents"]) for row in rows}
+    assert found == {
+        (algo, seed, step): level + (1 + 2 * seed) * step
+        for algo, level in {"matd3": 0, "td3": 500}.items()
+        for seed in (0, 1)
+        for step in (0, 20, 40)
+    }
+    table = (out / "table.md").read_text()
+    # Last returns 40 and 120: mean 80, sd 56.57, Student's 95 % interval 80 +- 12.706 * 40.
+    assert "| MATD3 | 2 | 40 | 80 ± 57 (-428 to 588) | 80 | 0.80 |" in table
+    assert "| SA-TD3 | 2 | 40 | 580 ± 57 (72 to 1088) | 580 | 5.80 |" in table
+    assert "IL-TD3" not in table  # never begun
+    facts = json.loads((out / "runs.json").read_text())
+    assert facts["matd3"]["summary"] == "not finished"
+    assert facts["td3"]["summary"] == {"total_steps": 40}
+    assert facts["td3"]["settings"]["algo"]["joint"] is True
+    assert (out / "curves.png").stat().st_size > 10_000
+
+
+def test_bad_input_is_named(tmp_path):
+    with pytest.raises(UserError, match="'matd4' is not one of matd3"):
+        ant.main(["algos=[matd4]"])
+    with pytest.raises(UserError, match="there is no run to report"):
+        ant.main(["train=false", f"runs={tmp_path}"])
