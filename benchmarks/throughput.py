@@ -86,8 +86,9 @@ def measure(
     for part, cycle in parts.items():
         if wanted is not None and part not in wanted:
             continue
-        # Cycles in one call: first a guess, then as many as take the wanted time.
-        cycles, compile_seconds = 2, None
+        # Cycles in one call: first a guess, then as many as take the wanted time; where compiling is dear (robots), the
+        # guess is called again and again instead.
+        cycles, calls, compile_seconds = 2, 1, None
         for attempt in range(2):
             program = trainer.program(cycle, cycles)
             begun = time.perf_counter()
@@ -96,12 +97,18 @@ def measure(
                 compile_seconds = time.perf_counter() - begun
             begun = time.perf_counter()
             state = jax.block_until_ready(program(state)[0])
-            cycles = max(2, round(cycles * seconds / (time.perf_counter() - begun)))
+            wanted_calls = seconds / (time.perf_counter() - begun)
+            if attempt == 0 and compile_seconds > 10:
+                calls = max(1, round(wanted_calls))
+                break
+            cycles = max(2, round(cycles * wanted_calls))
         times = []
         for _ in range(repeats):
             begun = time.perf_counter()
-            state = jax.block_until_ready(program(state)[0])
-            times.append(time.perf_counter() - begun)
+            for _ in range(calls):
+                state = program(state)[0]
+            jax.block_until_ready(state)
+            times.append((time.perf_counter() - begun) / calls)
         cycles = program.cycles
         steps = seeds * cycles * trainer.cycle_steps
         updates = seeds * cycles * trainer.cycle_collects * trainer.schedule.updates_per_collect
