@@ -1,8 +1,8 @@
 """Checkpoints: everything a run carries, written with Orbax, checked by checksum before it is read back.
 
-Layout of one: `STEP/state` (all but the replay), `STEP/replay/SEED` (the rows filled so far), `STEP/checksums.json`. A
-checkpoint appears under its name only when it is whole. The replay is written and read one seed at a time, so that it
-never stands in memory twice.
+Layout of one: `STEP/state` (all but the replay), `STEP/replay/SEED` (the rows filled so far; none in what a sweep
+leaves of its runs), `STEP/checksums.json`. A checkpoint appears under its name only when it is whole. The replay is
+written and read one seed at a time, so that it never stands in memory twice.
 """
 
 import hashlib
@@ -25,14 +25,18 @@ from matd3_jax.trainer import Trainer, TrainState
 logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax tells of every step at INFO and warns of its own defaults.
 
 
-def save(folder: Path, step: int, trainer: Trainer, state: TrainState, keep: int) -> Path:
-    """Write the checkpoint of env step `step` and delete all but the newest `keep`."""
+def save(folder: Path, step: int, trainer: Trainer, state: TrainState, keep: int, seeds: slice | None = None) -> Path:
+    """Write the checkpoint of env step `step` and delete all but the newest `keep`.
+
+    Args:
+        seeds: write these seeds' part alone, without their replay: enough to evaluate them, not to go on. None: all.
+    """
     folder = folder.resolve()
     final, partial_ = folder / str(step), folder / f".{step}.partial"
     shutil.rmtree(partial_, ignore_errors=True)
     with ocp.StandardCheckpointer() as checkpointer:
-        checkpointer.save(partial_ / "state", _leaves(trainer, state))
-        for seed, rows in _replay_rows(trainer, state):
+        checkpointer.save(partial_ / "state", _leaves(trainer, state, seeds or slice(None)))
+        for seed, rows in _replay_rows(trainer, state) if seeds is None else ():
             checkpointer.save(partial_ / "replay" / str(seed), {"rows": rows})
             checkpointer.wait_until_finished()
     (partial_ / "checksums.json").write_text(json.dumps(_checksums(partial_), indent=1))
@@ -73,7 +77,10 @@ def verify(folder: Path, step: int | None = None) -> Path:
 
 
 def restore(path: Path, trainer: Trainer) -> TrainState:
-    """The state in the checkpoint at `path`, as `verify` gave it. Raises UserError if it does not fit the trainer."""
+    """The state in the checkpoint at `path`, as `verify` gave it. Raises UserError if it has no replay or does not fit the
+    trainer."""
+    if not (path / "replay").is_dir():
+        raise UserError(f"{path} holds no replay: what a sweep leaves of a run can be evaluated, not gone on with")
     with ocp.StandardCheckpointer() as checkpointer:
         saved = checkpointer.restore(path / "state")
         small = _rebuild(trainer, saved, path)
@@ -114,12 +121,13 @@ def _replay_rows(trainer: Trainer, state: TrainState):
                 yield first + place, np.asarray(shard.data[place, :filled])
 
 
-def _leaves(trainer: Trainer, state: TrainState) -> dict[str, np.ndarray]:
-    """All leaves but the replay by path, keys as their data, without the copies that fill up the devices."""
+def _leaves(trainer: Trainer, state: TrainState, seeds: slice) -> dict[str, np.ndarray]:
+    """All leaves but the replay by path, keys as their data, without the copies that fill up the devices; `seeds` of
+    them."""
     plain = state._replace(replay=None, key=jax.random.key_data(state.key))  # type: ignore[arg-type]
     found = jax.tree_util.tree_flatten_with_path(plain)[0]
     whole = {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in found}
-    return {name: leaf[: trainer.num_seeds] if leaf.ndim else leaf for name, leaf in whole.items()}
+    return {name: leaf[: trainer.num_seeds][seeds] if leaf.ndim else leaf for name, leaf in whole.items()}
 
 
 def _rebuild(trainer: Trainer, saved: dict[str, Any], path: Path) -> TrainState:

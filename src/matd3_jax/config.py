@@ -1,6 +1,8 @@
 """Settings of a run: read from files and overrides in Hydra's grammar, typed, and checked before anything starts."""
 
+import copy
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -132,38 +134,54 @@ def load(overrides: Sequence[str] = ()) -> Config:
         values = [_renamed(o) for o in values if o.key_or_group.startswith("algo.")] + values
     if adversary:
         lines.append(f"+algo@adversary={adversary[-1]}")
-    with initialize_config_module("matd3_jax.conf", version_base=None):
-        try:
-            tree = compose("config", lines)
-            _check_keys(tree, values)
-            if "robot" not in tree and "schedule=wide" in lines:
-                raise UserError(f"schedule=wide is for robots; {tree.env.name} has the paper's only")
-            own = any(o.key_or_group in ("schedule", *SCHEDULE) for o in parsed)
-            if "robot" in tree and not own and devices.accelerated():
-                # One environment and minibatches of 100 would keep it waiting for the next kernel all the time.
-                lines.append("schedule=wide")
-            tree = compose("config", lines + [_line(o) for o in values])
-            resolved = OmegaConf.to_container(tree, resolve=True, throw_on_missing=True)
-        except (HydraException, OmegaConfBaseException) as error:
-            raise UserError(_one_line(error)) from error
+    try:
+        tree = _files(tuple(lines))
+        _check_keys(tree, values)
+        if "robot" not in tree and "schedule=wide" in lines:
+            raise UserError(f"schedule=wide is for robots; {tree.env.name} has the paper's only")
+        own = any(o.key_or_group in ("schedule", *SCHEDULE) for o in parsed)
+        if "robot" in tree and not own and devices.accelerated():
+            # One environment and minibatches of 100 would keep it waiting for the next kernel all the time.
+            lines.append("schedule=wide")
+        tree = copy.deepcopy(_files(tuple(lines)))
+        for override in values:
+            if override.is_add() and not override.is_force_add():
+                raise UserError(f"cannot add {_line(override)!r}: the key is there, write it without the +")
+            OmegaConf.update(tree, override.key_or_group, override.value())
+        resolved = OmegaConf.to_container(tree, resolve=True, throw_on_missing=True)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(_one_line(error)) from error
     assert isinstance(resolved, dict)
     for key in ("resume", "checkpoint", "robot"):  # the command's own, see train.py; what robots bring is in its place
         resolved.pop(key, None)
     return from_dict(resolved)  # type: ignore[arg-type]
 
 
-def parse(overrides: Sequence[str]) -> list[Override]:
-    """Overrides in Hydra's grammar. Raises UserError where one is malformed."""
+def parse(overrides: Sequence[str], sweep: bool = False) -> list[Override]:
+    """Overrides in Hydra's grammar; `sweep`: also with several values. Raises UserError where one is malformed."""
     parsed = []
     for text in overrides:
         try:
-            override = OverridesParser.create().parse_override(text)
+            override = _parser().parse_override(text)
         except (HydraException, OverrideParseException) as error:
-            raise UserError(f"cannot read {text!r}: write key=value, for instance algo.lr=0.003") from error
-        if override.is_delete() or override.is_sweep_override():
+            example = "key=value, for instance algo.lr=0.003" + (" or algo.lr=0.01,0.003" if sweep else "")
+            raise UserError(f"cannot read {text!r}: write {example}") from error
+        if override.is_delete() or override.is_sweep_override() and not sweep:
             raise UserError(f"cannot take {text!r} here: write key=value with one value")
         parsed.append(override)
     return parsed
+
+
+@functools.cache
+def _parser() -> OverridesParser:
+    return OverridesParser.create()
+
+
+@functools.cache
+def _files(lines: tuple[str, ...]) -> DictConfig:
+    """What the files say that `lines` choose; not to be changed."""
+    with initialize_config_module("matd3_jax.conf", version_base=None):
+        return compose("config", list(lines))
 
 
 def take(overrides: Sequence[str], keys: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
@@ -241,7 +259,7 @@ def _line(override: Override) -> str:
 
 def _renamed(override: Override) -> Override:
     line = _line(override)
-    return OverridesParser.create().parse_override(line.replace("algo.", "adversary.", 1))
+    return _parser().parse_override(line.replace("algo.", "adversary.", 1))
 
 
 def _one_line(error: BaseException) -> str:

@@ -1,6 +1,5 @@
 """`python -m matd3_jax.train env=simple_spread algo=matd3 seeds=4`: train, and leave a run directory."""
 
-import signal
 import sys
 import time
 import types
@@ -10,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from matd3_jax import checkpoint, command, config, devices, plotting
+from matd3_jax import checkpoint, command, config, devices, outcome, plotting
 from matd3_jax import training as training_module
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError
 from matd3_jax.progress import ProgressBar
 from matd3_jax.runs import RunDirectory
-from matd3_jax.statistics import mean_interval
+from matd3_jax.stopping import Stop
 from matd3_jax.trainer import TrainState
 from matd3_jax.training import Training
 
@@ -93,7 +92,7 @@ def resume(path: Path, step: Any, overrides: Sequence[str]) -> int:
     return _advance(training, run, state, row, stop)
 
 
-def _advance(training: Training, run: RunDirectory, state: TrainState, row: dict[str, np.ndarray], stop: "Stop") -> int:
+def _advance(training: Training, run: RunDirectory, state: TrainState, row: dict[str, np.ndarray], stop: Stop) -> int:
     """Chunk after chunk to the end, or until a signal comes."""
     settings, begun = training.config, time.monotonic()
     step = int(row["step"][0])
@@ -123,44 +122,17 @@ def _advance(training: Training, run: RunDirectory, state: TrainState, row: dict
         print(f"stopped by {stop.signal.name} at env step {step:,}; go on with: "
               f"python -m matd3_jax.train resume={run.path}")  # fmt: skip
         return 128 + stop.signal
-    finals = _finals(metrics)
-    summary = {
-        "total_steps": step,
-        "seconds": round(time.monotonic() - begun, 1),
-        **progress.rates(),
-        "last_tenth": finals,
-    }
+    summary = outcome.summary(metrics, row, seconds=round(time.monotonic() - begun, 1), **progress.rates())
     over = f"(95 % interval over {settings.seeds} seeds)"
-    for team, final in finals.items():
-        print(f"mean training return of {team} over the last tenth: {_interval(final, over)}")
+    for team, final in summary["last_tenth"].items():
+        print(f"mean training return of {team} over the last tenth: {outcome.text(final, over)}")
     if training.eval_every:
-        summary["last_evaluation"] = {
-            name.replace("eval_", "", 1): _final(values)
-            for name, values in row.items()
-            if name.startswith("eval_") or name.endswith("_eval_return")
-        }
         print(f"last evaluation ({settings.eval_episodes} deterministic episodes of each seed):")
-        for name, values in row.items():
-            if name.startswith("eval_"):
-                print(f"  {name.removeprefix('eval_')}: {_interval(_final(values), over)}")
+        for name in (name for name in row if name.startswith("eval_")):
+            print(f"  {name.removeprefix('eval_')}: {outcome.text(outcome.final(row[name]), over)}")
     run.write_summary(summary)
     print(f"learning curve: {run.curve}\nevaluate with: python -m matd3_jax.evaluate run={run.path}")
     return 0
-
-
-class Stop:
-    """SIGINT and SIGTERM end the run after the chunk at work; a second one ends it at once."""
-
-    def __init__(self) -> None:
-        self.signal: signal.Signals | None = None
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._remember)
-
-    def _remember(self, number: int, frame: object) -> None:
-        if self.signal is not None:
-            sys.exit(128 + number)
-        self.signal = signal.Signals(number)
-        print(f"\n{self.signal.name}: writing a checkpoint after this chunk (again: stop at once)", flush=True)
 
 
 def _announce(training: Training, run: RunDirectory) -> None:
@@ -183,29 +155,6 @@ def _title(training: Training) -> str:
 def _name(settings: Config) -> str:
     against = f"-vs-{settings.adversary.name}" if settings.adversary else ""
     return f"{settings.env['name']}-{settings.algo.name}{against}-{time.strftime('%Y%m%d-%H%M%S')}"
-
-
-def _finals(metrics: dict[str, np.ndarray]) -> dict[str, tuple[float, float | None]]:
-    """For each team `_final` of the mean training return in the last tenth of the run, if all seeds ended episodes."""
-    late = metrics["step"] > 0.9 * metrics["step"].max()
-    finals = {}
-    for name in (name for name in metrics if name.startswith("return_")):
-        there = late & ~np.isnan(metrics[name])  # long episodes need not end within a chunk
-        seeds = [metrics[name][there & (metrics["seed"] == s)] for s in np.unique(metrics["seed"])]
-        if all(values.size for values in seeds):
-            finals[name.removeprefix("return_")] = _final(np.array([values.mean() for values in seeds]))
-    return finals
-
-
-def _final(values: np.ndarray) -> tuple[float, float | None]:
-    """Mean and 95 % half width over seeds; None with one seed."""
-    mean, half = mean_interval(values)
-    return float(mean), float(half) if len(values) > 1 else None
-
-
-def _interval(final: tuple[float, float | None], over: str) -> str:
-    mean, half = final
-    return f"{mean:.4g}" if half is None else f"{mean:.4g} ± {half:.2g} {over}"
 
 
 def _tensorboard_writer(settings: Config, run: RunDirectory | None) -> Any:

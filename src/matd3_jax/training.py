@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from matd3_jax import config as configuration
 from matd3_jax import devices, envs
+from matd3_jax.algorithms import HyperParams
 from matd3_jax.config import Config
 from matd3_jax.envs.base import Environment
 from matd3_jax.envs.joint import JointTeam
@@ -41,17 +42,22 @@ class Result:
 
 
 class Training:
-    """Programs and plan of one run.
+    """Programs and plan of one run, or of several that share a program (a piece of a sweep).
 
     Args:
         config: checked settings.
         env: the environment; default: the one that `config.env` names.
+        members: settings of the runs side by side, which may differ in `HyperParams`, `seed` and `seeds` only; default
+            `config` alone. Wherever an axis [seeds] is, the seeds of the first come first.
 
     Raises UserError where the environment does not take its options, or a team has no agents.
     """
 
-    def __init__(self, config: Config, env: Environment | None = None):
+    def __init__(self, config: Config, env: Environment | None = None, members: Sequence[Config] | None = None):
         self.config = config
+        self.members = (config,) if members is None else tuple(members)
+        self.seeds = np.concatenate([np.arange(m.seed, m.seed + m.seeds) for m in self.members])
+        """[seeds] the number that each seed's key is made from."""
         base = envs.make(**config.env) if env is None else env
         teams = config.teams()
         if config.adversary is not None and "adversaries" not in base.teams:
@@ -72,9 +78,9 @@ class Training:
             shared_minibatch=config.shared_minibatch,
             sequential=config.update_order == "sequential",
         )
-        hyper = {team: algo.hyper_params() for team, algo in teams.items()}
-        normalise = config.normalise_observations
-        trainer = Trainer(self.env, self.spec, schedule, hyper, config.seeds, normalise_observations=normalise)
+        hyper = {team: self._hyper(team) for team in teams}
+        seeds, normalise = len(self.seeds), config.normalise_observations
+        trainer = Trainer(self.env, self.spec, schedule, hyper, seeds, normalise_observations=normalise)
         # Whole chunks of equal length, so that one compiled program does for all; as many as come closest to log_every.
         cycles = max(1, math.ceil((config.total_steps - trainer.prefill_steps) / trainer.cycle_steps))
         wanted = max(1, round((config.log_every or config.total_steps / 100) / trainer.cycle_steps))
@@ -85,7 +91,12 @@ class Training:
         # Rows that would never be written are not allocated: the same result in less memory.
         capacity = min(config.replay_capacity, self.total_steps)
         schedule = dataclasses.replace(schedule, replay_capacity=capacity)
-        self.trainer = Trainer(self.env, self.spec, schedule, hyper, config.seeds, normalise_observations=normalise)
+        self.trainer = Trainer(self.env, self.spec, schedule, hyper, seeds, normalise_observations=normalise)
+
+    def _hyper(self, team: str) -> HyperParams:
+        """The team's hyper-parameters, leaves [seeds]."""
+        each = [m.teams()[team].hyper_params() for m in self.members for _ in range(m.seeds)]
+        return jax.tree.map(lambda *leaves: np.array(leaves, np.float32), *each)
 
     # ---- memory ------------------------------------------------------------------------------------------------------
 
@@ -112,7 +123,7 @@ class Training:
 
     def keys(self) -> jax.Array:
         """One key a seed; a seed's key does not depend on the seeds beside it."""
-        return jax.vmap(jax.random.key)(np.arange(self.config.seed, self.config.seed + self.config.seeds))
+        return jax.vmap(jax.random.key)(self.seeds)
 
     def start(self) -> tuple[TrainState, Row]:
         """The state after the prefill, and what the untrained policies got there."""
@@ -140,11 +151,11 @@ class Training:
 
     def row(self, state: TrainState, metrics: Metrics) -> Row:
         """The chunk's row of the metrics table for each seed."""
-        seeds = self.config.seeds
+        seeds = len(self.seeds)
         collects = int(state.collects)
         row: Row = {
             "step": np.full(seeds, self.trainer.env_steps(collects)),
-            "seed": np.arange(self.config.seed, self.config.seed + seeds),
+            "seed": self.seeds,
             "updates": np.full(seeds, self.trainer.updates(collects)),
         }
         episodes = Episodes(*(np.asarray(e, np.float64)[:seeds].sum(axis=1) for e in metrics.episodes))
@@ -182,7 +193,7 @@ class Training:
         which `seed` gives."""
         # Apart from the training's keys, which are split from key(seed).
         key = jax.random.fold_in(jax.random.key(seed), 2**31 - 1)
-        keys = jax.vmap(lambda _: key)(np.arange(self.config.seeds))
+        keys = jax.vmap(lambda _: key)(self.seeds)
         found = self.trainer.evaluate(state, keys, episodes, deterministic)
         return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), found)
 
@@ -193,10 +204,10 @@ class Training:
             return {}
         if state is None:
             sizes = (self.spec.num_agents, 1, len(self.env.measures))
-            returns, length, measures = (np.full((self.config.seeds, size), np.nan) for size in sizes)
+            returns, length, measures = (np.full((len(self.seeds), size), np.nan) for size in sizes)
         else:
             found = self.evaluate(state, self.config.eval_episodes, deterministic=True)
-            returns, length, measures = (leaf.mean(axis=1).reshape(self.config.seeds, -1) for leaf in found)
+            returns, length, measures = (leaf.mean(axis=1).reshape(len(self.seeds), -1) for leaf in found)
         columns = {f"eval_return_{team}": returns @ self.team_weights(team) for team in dict.fromkeys(self.spec.teams)}
         columns["eval_episode_length"] = length[:, 0]
         columns |= {f"eval_{name}": measures[:, k] for k, name in enumerate(self.env.measures)}
