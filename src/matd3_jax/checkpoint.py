@@ -77,8 +77,8 @@ def verify(folder: Path, step: int | None = None) -> Path:
 
 
 def restore(path: Path, trainer: Trainer) -> TrainState:
-    """The state in the checkpoint at `path`, as `verify` gave it. Raises UserError if it has no replay or does not fit the
-    trainer."""
+    """The state in the checkpoint at `path`, as `verify` gave it. Raises UserError if it holds no replay or does not
+    fit the trainer."""
     if not (path / "replay").is_dir():
         raise UserError(f"{path} holds no replay: what a sweep leaves of a run can be evaluated, not gone on with")
     with ocp.StandardCheckpointer() as checkpointer:

@@ -7,11 +7,15 @@ from matd3_jax.envs.base import OptionError
 from matd3_jax.errors import UserError
 
 
-def run(main: Callable[[Sequence[str]], int]) -> None:
-    """Run a command's `main` on the command line's arguments and leave with its exit code."""
+def code(main: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
+    """Run a command's `main`: its exit code, or 2 after an error line."""
     try:
-        code = main(sys.argv[1:])
+        return main(argv)
     except (UserError, OptionError) as error:
         print(f"error: {error}", file=sys.stderr)
-        code = 2
-    sys.exit(code)
+        return 2
+
+
+def run(main: Callable[[Sequence[str]], int]) -> None:
+    """Run a command's `main` on the command line's arguments and leave with its exit code."""
+    sys.exit(code(main, sys.argv[1:]))

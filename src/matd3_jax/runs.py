@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -58,6 +59,12 @@ class RunDirectory:
             if new:
                 writer.writerow(row)
             writer.writerows(zip(*(map(_text, column) for column in row.values()), strict=True))
+
+    def clear(self) -> None:
+        """Take away all but settings and machine: the run begins anew."""
+        for path in (self.metrics, self.curve, self.path / "summary.json"):
+            path.unlink(missing_ok=True)
+        shutil.rmtree(self.checkpoints, ignore_errors=True)
 
     def cut(self, step: int) -> None:
         """Drop the rows after env step `step`: they will be written again."""

@@ -144,12 +144,12 @@ def _interval(text: str, key: str, value: Any) -> Axis:
 
 
 def names(axes: Sequence[Axis], settings: Sequence[dict[str, str]]) -> list[str]:
-    """A short name for each setting, `lr=0.01,tau=0.005`, that can name a folder."""
+    """A short name for each setting, `lr_0.01-tau_0.005`, that can name a folder and stand on a command line."""
     last = [axis.key.rsplit(".", 1)[-1] for axis in axes]
     shorts = [short if last.count(short) == 1 else axis.key for axis, short in zip(axes, last, strict=True)]
     found = []
     for k, setting in enumerate(settings):
-        name = ",".join(f"{short}={value}" for short, value in zip(shorts, setting.values(), strict=True))
-        name = "".join(c if c.isalnum() or c in "=,.+-_[]" else "_" for c in name)
+        name = "-".join(f"{short}_{value}" for short, value in zip(shorts, setting.values(), strict=True))
+        name = "".join(c for c in name.replace(",", "x") if c.isalnum() or c in ".+-_")
         found.append(name if 0 < len(name) <= 120 else f"setting_{k:04d}")
     return found if len(set(found)) == len(found) else [f"setting_{k:04d}" for k in range(len(found))]
