@@ -199,7 +199,7 @@ def moves(monkeypatch, delays, updates):
 
     def stay(env, spec, policy, env_state, key, length, **options):
         rows = jnp.zeros((length * env_state.episode_step.shape[0], spec.row_size))
-        return env_state, rows, rollout.Episodes(jnp.int32(0), jnp.zeros(spec.num_agents), jnp.int32(0))
+        return env_state, rows, rollout.Episodes(jnp.int32(0), jnp.zeros(spec.num_agents), jnp.int32(0)), None
 
     monkeypatch.setattr(rollout, "collect", stay)
     trainer = make([0], dataclasses.replace(SCHEDULE, updates_per_collect=updates), delays)

@@ -21,8 +21,9 @@ from matd3_jax.errors import UserError
 from matd3_jax.typed import plain, typed
 from matd3_jax.validation import check
 
-ADDED_LATER = {"eval_every": 0, "eval_episodes": 10, "n_step": 1, "normalise_observations": False}
-"""Keys that runs from before them lack, with the values that those runs had in effect."""
+ADDED_LATER = {"eval_every": 0, "eval_episodes": 10, "n_step": 1, "normalise_observations": False,
+               "diagnostics": {"q_bias": False, "q_bias_rollouts": 200, "q_bias_steps": 100}}  # fmt: skip
+"""Keys that runs from before them lack, with the values that those runs had in effect; a group may lack some, too."""
 
 GROUPS = ("env", "algo", "adversary", "schedule")
 """Keys that choose a file; `adversary` takes the files of `algo`."""
@@ -67,6 +68,15 @@ class AlgoConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class DiagnosticsConfig:
+    """What a run measures of itself beside its returns; conf/config.yaml says what each means."""
+
+    q_bias: bool
+    q_bias_rollouts: int
+    q_bias_steps: int
+
+
+@dataclasses.dataclass(frozen=True)
 class Config:
     """All settings of a run; conf/config.yaml says what each means."""
 
@@ -94,6 +104,7 @@ class Config:
     log_every: int | None
     eval_every: int | None
     eval_episodes: int
+    diagnostics: DiagnosticsConfig
     checkpoint_every: int | None
     keep_checkpoints: int
     tensorboard: bool
@@ -206,7 +217,7 @@ def read(path: Path) -> Config:
     try:
         found = OmegaConf.to_container(OmegaConf.load(path))
         assert isinstance(found, dict)
-        return from_dict({**ADDED_LATER, **found})  # type: ignore[dict-item]
+        return from_dict(_with_defaults(found, ADDED_LATER))
     except (OSError, AssertionError, ValueError, OmegaConfBaseException) as error:
         raise UserError(f"cannot read the configuration {path}: {_one_line(error)}") from error
 
@@ -229,9 +240,23 @@ def from_dict(values: Mapping[str, Any]) -> Config:
     adversary = rest.pop("adversary", None)
     if adversary is not None:
         adversary = typed(AlgoConfig, {k: v for k, v in adversary.items() if k != "lr"}, "adversary.")
-    config = typed(Config, {**rest, "env": env, "algo": algo, "adversary": adversary}, "")
+    diagnostics = rest.pop("diagnostics", None)
+    if not isinstance(diagnostics, Mapping):
+        raise UserError(f"diagnostics={diagnostics!r}: must be a group of keys, for instance diagnostics.q_bias=true")
+    diagnostics = typed(DiagnosticsConfig, diagnostics, "diagnostics.")
+    groups = {"env": env, "algo": algo, "adversary": adversary, "diagnostics": diagnostics}
+    config = typed(Config, {**rest, **groups}, "")
     check(config)
     return config
+
+
+def _with_defaults(found: Mapping[Any, Any], defaults: Mapping[str, Any]) -> dict[Any, Any]:
+    """`found` with the keys that it lacks, also within its groups."""
+    values = {**defaults, **found}
+    for key, default in defaults.items():
+        if isinstance(default, Mapping) and isinstance(values[key], Mapping):
+            values[key] = {**default, **values[key]}
+    return values
 
 
 def _check_keys(tree: DictConfig, values: Sequence[Override]) -> None:
@@ -243,7 +268,8 @@ def _check_keys(tree: DictConfig, values: Sequence[Override]) -> None:
                 prefix = ".".join(path[:depth])
                 keys = [str(key) for key in node] if isinstance(node, DictConfig) else []
                 # A key typed without its group, or in the wrong one, is a common slip: look there, too.
-                elsewhere = [f"{group}.{name}" for group in ("algo", "env") if name in tree.get(group, {})]
+                groups = ("algo", "env", "diagnostics")
+                elsewhere = [f"{group}.{name}" for group in groups if name in tree.get(group, {})]
                 elsewhere += [name] if depth and name in tree else []
                 hint = f"did you mean {' or '.join(map(repr, elsewhere))}?" if elsewhere else nearest(name, keys)
                 raise UserError(

@@ -12,9 +12,6 @@ from matd3_jax.algorithms import HyperParams
 from matd3_jax.config import AlgoConfig, Config
 from matd3_jax.errors import UserError
 
-WHERE = ("name", "out", "checkpoint_every", "keep_checkpoints", "tensorboard")
-"""Settings that change nothing in what a run computes."""
-
 
 def program(config: Config) -> str:
     """A text that is the same for all settings whose runs can share one program: all but hyper-parameters, seeds and

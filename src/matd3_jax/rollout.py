@@ -70,11 +70,13 @@ def collect(
     key: chex.PRNGKey,
     length: int,
     random: bool = False,
-) -> tuple[EnvState, chex.Array, Episodes]:
+    keep_states: bool = False,
+) -> tuple[EnvState, chex.Array, Episodes, Any]:
     """Play `length` steps in every environment with the exploring policies; episodes that end start anew.
 
     Returns the environments, the replay rows [length * num_envs, row_size] (the true next observation in them, also
-    where an episode ended) and what ended on the way.
+    where an episode ended), what ended on the way, and the state of the environment before each row's action, leading
+    axis [length * num_envs] (None unless `keep_states`).
 
     random: act uniformly at random instead: warm-up without the policies.
     """
@@ -85,6 +87,7 @@ def collect(
 
     def step(carry: EnvState, inputs):
         draws, step_keys, fresh = inputs
+        before = carry.state if keep_states else None
         action = spec.join_actions(draws) if random else act(spec, policy, carry.observation, draws)
         after = jax.vmap(env.step)(step_keys, carry.state, env_actions(spec, action))
         x, next_x = (jnp.concatenate(o, axis=-1) for o in (carry.observation, after.observation))
@@ -101,13 +104,14 @@ def collect(
             (after.state, after.observation),
         )
         carry = EnvState(state, observation, jnp.where(ended[:, None], 0, returns), jnp.where(ended, 0, steps))
-        return carry, (rows, episodes)
+        return carry, (rows, episodes, before)
 
     step_keys, reset_keys = (jax.random.split(k, (length, num_envs)) for k in (step_key, reset_key))
     # Every step has a fresh start at hand, drawn in one batch: inside the loop they would be as many, drawn one by one.
     fresh = jax.vmap(jax.vmap(env.reset))(reset_keys)
-    env_state, (rows, episodes) = jax.lax.scan(step, env_state, (noise, step_keys, fresh))
-    return env_state, rows.reshape(length * num_envs, -1), jax.tree.map(lambda e: e.sum(axis=0), episodes)
+    env_state, (rows, episodes, states) = jax.lax.scan(step, env_state, (noise, step_keys, fresh))
+    rows, states = jax.tree.map(lambda leaf: leaf.reshape(length * num_envs, *leaf.shape[2:]), (rows, states))
+    return env_state, rows, jax.tree.map(lambda e: e.sum(axis=0), episodes), states
 
 
 def evaluate(
@@ -157,11 +161,12 @@ def act(
     spec: Spec,
     policy: Policy,
     observation: Sequence[chex.Array],
-    draws: Sequence[chex.Array] | None,
+    draws: Sequence[chex.Array | None] | None,
 ) -> chex.Array:
     """Joint actions [envs, action_size] for one observation [envs, size] per agent.
 
-    draws: noise [members, envs, action size] per group (see `networks.noise`); None: deterministic actions.
+    draws: noise [members, envs, action size] per group (see `networks.noise`); None, for one group or all:
+            deterministic actions.
     """
     parts, statistics = [], policy.statistics
     if statistics is not None:

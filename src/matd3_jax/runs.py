@@ -18,7 +18,7 @@ class RunDirectory:
     """Where a run leaves its files.
 
     config.yaml (all resolved settings), machine.json (versions and devices), metrics.csv (one row a chunk and seed),
-    checkpoints/, learning_curve.png, summary.json (written at the end), tensorboard/ on request.
+    checkpoints/, learning_curve.png, summary.json (written at the end), on request q_bias.png and tensorboard/.
     """
 
     def __init__(self, path: Path):
@@ -26,6 +26,7 @@ class RunDirectory:
         self.checkpoints = path / "checkpoints"
         self.metrics = path / "metrics.csv"
         self.curve = path / "learning_curve.png"
+        self.q_bias = path / "q_bias.png"
         self.tensorboard = path / "tensorboard"
 
     @classmethod

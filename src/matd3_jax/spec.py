@@ -56,6 +56,10 @@ class Spec:
     def num_agents(self) -> int:
         return len(self.agents)
 
+    def by_team(self) -> dict[str, list[str]]:
+        """Names of the agents of each team."""
+        return {t: [a for a, team in zip(self.agents, self.teams, strict=True) if team == t] for t in self.teams}
+
     @property
     def observation_size(self) -> int:
         return sum(self.observation_sizes)

@@ -39,9 +39,11 @@ def draw(path: Path, folder: Path, runs: Mapping[str, Sequence[str]], rows: Sequ
 
 
 def _curves(axis, folder: Path, runs: Mapping[str, Sequence[str]], rows: Sequence[Ranked], metric: str) -> None:
+    means = []
     for k, row in reversed(list(enumerate(rows))):
         tables = [by_seed(RunDirectory(folder / run).read_metrics(), metric) for run in runs[row.name]]
         steps, curves = tables[0][0], np.concatenate([values for _, values in tables])
+        means.append(curves.mean(axis=0))
         if k >= len(BEST):
             axis.plot(
                 steps, curves.mean(axis=0), color="0.75", linewidth=0.8, label="others" if k == len(BEST) else None
@@ -56,11 +58,19 @@ def _curves(axis, folder: Path, runs: Mapping[str, Sequence[str]], rows: Sequenc
     axis.set_xlabel("env steps of each seed")
     axis.set_ylabel(metric)
     axis.set_title("mean over seeds, 95 % interval", fontsize=10)
+    axis.set_ylim(*_limits(np.concatenate(means)))
     _clean(axis)
 
 
+def _limits(means: np.ndarray) -> tuple[float, float]:
+    """A range that holds all means: intervals of few seeds reach far beyond what there is to see."""
+    low, high = np.nanmin(means), np.nanmax(means)
+    room = 0.1 * (high - low or 1.0)
+    return float(low - room), float(high + room)
+
+
 def _values(axis, key: str, rows: Sequence[Ranked], metric: str) -> None:
-    """Final mean of every setting over its value of `key`; a short line is the median of those that share a value."""
+    """Final mean of every setting over its value of `key`: the best in blue, and a line at the median of each value."""
     texts = [row.values[key] for row in rows]
     finals = np.array([row.interval("final")[0] for row in rows])
     try:

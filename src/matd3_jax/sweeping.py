@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from matd3_jax import checkpoint, devices, outcome, plan, plotting
+from matd3_jax import checkpoint, devices, outcome, overestimation, plan, plotting
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError
 from matd3_jax.memory import fitting_seeds, needed
@@ -164,7 +164,11 @@ class Piece:
             checkpoint.save(run.checkpoints, int(row["step"][0]), self.training.trainer, state, keep=1, seeds=seeds)
             metrics = run.read_metrics()
             plotting.learning_curve(run.curve, metrics, str(config.name))
-            run.write_summary(outcome.summary(metrics, {n: values[seeds] for n, values in row.items()}, **facts))
+            summary = outcome.summary(metrics, {n: values[seeds] for n, values in row.items()}, **facts)
+            if config.diagnostics.q_bias:
+                summary["overestimation"] = overestimation.summary(metrics, self.training.spec.agents)
+                overestimation.draw(run.q_bias, metrics, self.training.spec.by_team(), str(config.name))
+            run.write_summary(summary)
 
     def _announce(self) -> None:
         training, config = self.training, self.members[0]

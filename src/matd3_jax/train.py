@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from matd3_jax import checkpoint, command, config, devices, outcome, plotting
+from matd3_jax import checkpoint, command, config, devices, outcome, overestimation, plotting
 from matd3_jax import training as training_module
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError
@@ -118,6 +118,8 @@ def _advance(training: Training, run: RunDirectory, state: TrainState, row: dict
     checkpoint.save(run.checkpoints, step, training.trainer, state, settings.keep_checkpoints)
     metrics = run.read_metrics()
     plotting.learning_curve(run.curve, metrics, _title(training))
+    if settings.diagnostics.q_bias:
+        overestimation.draw(run.q_bias, metrics, training.spec.by_team(), _title(training))
     if stop.signal is not None and step < training.total_steps:
         print(f"stopped by {stop.signal.name} at env step {step:,}; go on with: "
               f"python -m matd3_jax.train resume={run.path}")  # fmt: skip
@@ -130,6 +132,11 @@ def _advance(training: Training, run: RunDirectory, state: TrainState, row: dict
         print(f"last evaluation ({settings.eval_episodes} deterministic episodes of each seed):")
         for name in (name for name in row if name.startswith("eval_")):
             print(f"  {name.removeprefix('eval_')}: {outcome.text(outcome.final(row[name]), over)}")
+    if settings.diagnostics.q_bias:
+        summary["overestimation"] = overestimation.summary(metrics, training.spec.agents)
+        for line in overestimation.lines(metrics, training.spec.agents, settings.diagnostics.q_bias_rollouts):
+            print(line)
+        print(f"estimated and true values: {run.q_bias}")
     run.write_summary(summary)
     print(f"learning curve: {run.curve}\nevaluate with: python -m matd3_jax.evaluate run={run.path}")
     return 0
@@ -144,6 +151,9 @@ def _announce(training: Training, run: RunDirectory) -> None:
     print(f"schedule: {settings.num_envs} x {settings.rollout_length} env steps, then {settings.updates_per_collect} "
           f"updates with {settings.batch_size} transitions")  # fmt: skip
     print(training.memory, flush=True)
+    diagnostics = settings.diagnostics
+    if diagnostics.q_bias and (note := overestimation.tail_note(trainer.hyper, diagnostics.q_bias_steps)):
+        print(f"note: {note}", flush=True)
 
 
 def _title(training: Training) -> str:

@@ -12,11 +12,12 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from matd3_jax import learner, normalisation, replay, returns, rollout
+from matd3_jax import learner, normalisation, q_bias, replay, returns, rollout
 from matd3_jax.algorithms import HyperParams
 from matd3_jax.envs.base import Environment
 from matd3_jax.learner import GroupState, UpdateMetrics
 from matd3_jax.normalisation import Statistics
+from matd3_jax.q_bias import Pairs, Reservoir, Values
 from matd3_jax.rollout import EnvState, Episodes, Evaluation, Policy
 from matd3_jax.schedule import Schedule
 from matd3_jax.spec import Spec
@@ -34,6 +35,8 @@ class TrainState(NamedTuple):
     """int32 scalar: collects done, prefill included. Steps, updates and the replay's cursor follow from it."""
     statistics: Statistics | None = None
     """Of the observations collected; None where they are not normalised."""
+    reservoir: Reservoir | None = None
+    """What the critics are judged on (see `q_bias`); None where they are not. `since` has no axis [seeds]."""
 
 
 class Metrics(NamedTuple):
@@ -56,6 +59,8 @@ class Trainer:
             all of them elsewhere.
         normalise_observations: networks see observations in units of their running mean and standard deviation; the
             replay keeps them as they are.
+        q_bias_pairs: states and actions that each seed keeps for `measure_q_bias`; 0: none, and no trace of it in the
+            programs.
     """
 
     def __init__(
@@ -68,9 +73,10 @@ class Trainer:
         devices: Sequence[jax.Device] | None = None,
         piece: int | None = None,
         normalise_observations: bool = False,
+        q_bias_pairs: int = 0,
     ):
         self.env, self.spec, self.schedule, self.num_seeds = env, spec, schedule, num_seeds
-        self.normalise_observations = normalise_observations
+        self.normalise_observations, self.q_bias_pairs = normalise_observations, q_bias_pairs
         updates = schedule.updates_per_collect
         for group in spec.groups:
             delay = group.algorithm.policy_delay
@@ -170,6 +176,9 @@ class Trainer:
         def init(keys):
             groups, env, keys = jax.vmap(one)(keys)
             state = TrainState(groups, env, jnp.zeros((keys.shape[0], 0, 0)), keys, jnp.int32(0))
+            if self.q_bias_pairs:
+                pairs = jax.vmap(lambda s: q_bias.allocate(s, self.q_bias_pairs, self.spec))(env.state)
+                state = state._replace(reservoir=Reservoir(pairs, jnp.int32(0)))
             if not self.normalise_observations:
                 return state
             fresh = normalisation.initial(self.spec.observation_size)
@@ -185,7 +194,8 @@ class Trainer:
     def _fields(self, seeds: Any, everywhere: Any) -> TrainState:
         """A prefix tree of the state: what stands for leaves with and without the axis [seeds]."""
         statistics = seeds if self.normalise_observations else None
-        return TrainState(seeds, seeds, seeds, seeds, everywhere, statistics)
+        reservoir = Reservoir(seeds, everywhere) if self.q_bias_pairs else None
+        return TrainState(seeds, seeds, seeds, seeds, everywhere, statistics, reservoir)
 
     def policy(self, state: TrainState, hyper: tuple[HyperParams, ...] | None = None) -> Policy:
         """How each seed acts, leading axis [seeds]. hyper: of the seeds in `state`; default: of all."""
@@ -196,10 +206,18 @@ class Trainer:
         """One collect of all local seeds."""
 
         def one(policy, env, key):
-            return rollout.collect(self.env, self.spec, policy, env, key, self.schedule.rollout_length, random=random)
+            length, kept = self.schedule.rollout_length, self.q_bias_pairs > 0
+            return rollout.collect(self.env, self.spec, policy, env, key, length, random=random, keep_states=kept)
 
         keys = jax.vmap(partial(jax.random.split, num=2))(state.key)
-        env, rows, episodes = jax.vmap(one)(self.policy(state, hyper), state.env, keys[:, 0])
+        env, rows, episodes, states = jax.vmap(one)(self.policy(state, hyper), state.env, keys[:, 0])
+        if state.reservoir is not None:
+            # A key apart from those that `rollout.collect` splits off the same one: training stays as it is without.
+            apart = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys[:, 0], q_bias.APART)
+            share = 1 / (state.collects + 1.0 - state.reservoir.since)
+            new = Pairs(states, self.spec.row_parts(rows).inputs)
+            pairs = jax.vmap(q_bias.keep, in_axes=(0, 0, None, 0))(state.reservoir.pairs, new, share, apart)
+            state = state._replace(reservoir=state.reservoir._replace(pairs=pairs))
         if state.statistics is not None:
             x = self.spec.row_parts(rows).x
             merge = jax.vmap(normalisation.merge, in_axes=(0, 0, None))
@@ -311,6 +329,30 @@ class Trainer:
             return self._sharded(jax.vmap(one), P("seeds"), P("seeds"))(policy, keys)
 
         return jax.jit(evaluate, static_argnums=(2, 3))
+
+    def measure_q_bias(self, state: TrainState, steps: int) -> Values:
+        """`q_bias.measure` of each seed's reservoir with rollouts of `steps` env steps, leading axis [num_seeds]."""
+        assert state.reservoir is not None
+        critics = tuple(group.critic for group in state.groups)
+        found = self._measure_q_bias(self.policy(state), critics, state.reservoir.pairs, state.key, steps)
+        return jax.tree.map(lambda leaf: leaf[: self.num_seeds], found)
+
+    @cached_property
+    def _measure_q_bias(self) -> Callable:
+        def measure(policy, critics, pairs, keys, steps):
+            def one(policy, critics, pairs, key):
+                apart = jax.random.fold_in(key, q_bias.APART)
+                return q_bias.measure(self.env, self.spec, policy, critics, pairs, apart, steps)
+
+            return self._sharded(jax.vmap(one), P("seeds"), P("seeds"))(policy, critics, pairs, keys)
+
+        return jax.jit(measure, static_argnums=4)
+
+    def restart_reservoir(self, state: TrainState) -> TrainState:
+        """Forget what the reservoir holds: after an evaluation."""
+        assert state.reservoir is not None
+        since = jax.device_put(np.int32(state.collects), self.shardings.reservoir.since)  # type: ignore[union-attr]
+        return state._replace(reservoir=state.reservoir._replace(since=since))
 
 
 class Program(NamedTuple):

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from matd3_jax import config as configuration
-from matd3_jax import devices, envs
+from matd3_jax import devices, envs, overestimation
 from matd3_jax.algorithms import HyperParams
 from matd3_jax.config import Config
 from matd3_jax.envs.base import Environment
@@ -91,7 +91,10 @@ class Training:
         # Rows that would never be written are not allocated: the same result in less memory.
         capacity = min(config.replay_capacity, self.total_steps)
         schedule = dataclasses.replace(schedule, replay_capacity=capacity)
-        self.trainer = Trainer(self.env, self.spec, schedule, hyper, seeds, normalise_observations=normalise)
+        kept = config.diagnostics.q_bias_rollouts if config.diagnostics.q_bias else 0
+        self.trainer = Trainer(
+            self.env, self.spec, schedule, hyper, seeds, normalise_observations=normalise, q_bias_pairs=kept
+        )
 
     def _hyper(self, team: str) -> HyperParams:
         """The team's hyper-parameters, leaves [seeds]."""
@@ -130,7 +133,9 @@ class Training:
         self.check_memory()
         state, episodes = self.trainer.prefill(self.trainer.init(self.keys()))
         row = self.row(state, Metrics(episodes, None))  # type: ignore[arg-type]
-        return state, {**row, **self.evaluation_columns(state)}
+        row |= self.evaluation_columns(state)
+        state, columns = self.q_bias(state, due=True)
+        return state, row | columns
 
     @cached_property
     def chunk(self) -> Program:
@@ -143,7 +148,9 @@ class Training:
         state, metrics = self.chunk(state)
         step, every = self.step(state), self.eval_every
         due = every > 0 and (step // every > before // every or step >= self.total_steps)
-        return state, {**self.row(state, metrics), **self.evaluation_columns(state if due else None)}
+        row = self.row(state, metrics) | self.evaluation_columns(state if due else None)
+        state, columns = self.q_bias(state, due)
+        return state, row | columns
 
     def step(self, state: TrainState) -> int:
         """Env steps of each seed so far."""
@@ -213,6 +220,15 @@ class Training:
         columns |= {f"eval_{name}": measures[:, k] for k, name in enumerate(self.env.measures)}
         columns |= {f"{agent}_eval_return": returns[:, i] for i, agent in enumerate(self.spec.agents)}
         return columns
+
+    def q_bias(self, state: TrainState, due: bool) -> tuple[TrainState, Row]:
+        """The state with its reservoir restarted, and what an evaluation says of the critics (see
+        `overestimation.columns`); the same state and nan where none is due. No columns with diagnostics.q_bias off."""
+        if state.reservoir is None:
+            return state, {}
+        found = self.trainer.measure_q_bias(state, self.config.diagnostics.q_bias_steps) if due else None
+        state = self.trainer.restart_reservoir(state) if due else state
+        return state, overestimation.columns(self.spec.agents, found, len(self.seeds))
 
 
 def train(

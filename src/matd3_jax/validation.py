@@ -32,6 +32,14 @@ def check(config: "Config") -> None:
     for key in ("eval_every", "checkpoint_every"):
         value = getattr(config, key)
         need(value is None or value >= 0, f"{key}={value}: must not be negative")
+    diagnostics = config.diagnostics
+    for key in ("q_bias_rollouts", "q_bias_steps"):
+        value = getattr(diagnostics, key)
+        need(value >= 1, f"diagnostics.{key}={value}: must be at least 1")
+    need(
+        not (diagnostics.q_bias and config.eval_every == 0),
+        "diagnostics.q_bias=true measures at evaluations, and eval_every=0 means none: give eval_every=, in env steps",
+    )
     for name, team in {"algo": config.algo, "adversary": config.adversary}.items():
         if team is not None:
             _check_team(name, team, config.updates_per_collect, need)

@@ -1,0 +1,140 @@
+"""How far the critics overestimate: columns of the metrics table, what a run says of them, and the figure."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from matd3_jax.algorithms import HyperParams
+from matd3_jax.envs.colours import AGENT, BLACK, Colour
+from matd3_jax.plotting import by_seed, curve
+from matd3_jax.q_bias import Values
+from matd3_jax.statistics import mean_interval
+
+COLUMNS = ("q_estimate", "q_true", "q_true_interval", "overestimation", "overestimation_interval")
+"""Of each agent, in the metrics table as AGENT_COLUMN."""
+
+TOLERATED_TAIL = 0.02
+"""Share of a constant reward's value beyond the rollouts' end, gamma^steps, above which a run says so."""
+
+Final = tuple[float, float | None]
+"""Mean and half width of its 95 % interval over seeds; None with one seed."""
+
+
+def columns(agents: Sequence[str], found: Values | None, seeds: int) -> dict[str, np.ndarray]:
+    """Columns [seeds] of the metrics table: means over the pairs, overestimation = estimate - truth, and half widths of
+    95 % confidence intervals (Student's t, the pairs taken as independent; nan for one pair).
+
+    found: [seeds, pairs, num_agents]; None: nan everywhere.
+    """
+    if found is None:
+        return {f"{agent}_{name}": np.full(seeds, np.nan) for agent in agents for name in COLUMNS}
+    estimates, truths = (np.asarray(values, np.float64) for values in found)
+    truth, truth_half = mean_interval(truths, axis=1)
+    over, over_half = mean_interval(estimates - truths, axis=1)
+    table = dict(zip(COLUMNS, (estimates.mean(axis=1), truth, truth_half, over, over_half), strict=True))
+    return {f"{agent}_{name}": table[name][:, i] for i, agent in enumerate(agents) for name in COLUMNS}
+
+
+def tail_note(hyper: Sequence[HyperParams], steps: int) -> str | None:
+    """One line where rollouts of `steps` end too early to stand beside the critics' infinite horizon; else None."""
+    gamma = max(float(np.max(h.gamma)) for h in hyper)
+    if gamma**steps <= TOLERATED_TAIL:
+        return None
+    line = (
+        f"diagnostics.q_bias_steps={steps} leaves out {100 * gamma**steps:.0f} % of a constant reward's value "
+        f"(gamma {gamma:g}), which counts as overestimation where rewards are positive"
+    )
+    if gamma == 1:
+        return line
+    enough = math.ceil(math.log(TOLERATED_TAIL) / math.log(gamma))
+    return f"{line}; diagnostics.q_bias_steps={enough} leaves out {100 * TOLERATED_TAIL:.0f} %"
+
+
+def summary(metrics: Mapping[str, np.ndarray], agents: Sequence[str]) -> dict[str, dict[str, Final]]:
+    """For each agent its last estimate, truth and overestimation, and the mean overestimation of all evaluations after
+    the first, which is of untrained critics.
+
+    Args:
+        metrics: columns [rows] of the metrics table.
+    """
+    found = {}
+    for agent in agents:
+        values = {name: by_seed(metrics, f"{agent}_{name}")[1] for name in ("q_estimate", "q_true", "overestimation")}
+        found[agent] = {name: _final(curves[:, -1]) for name, curves in values.items()}
+        over = values["overestimation"]
+        found[agent]["overestimation_mean"] = _final(over[:, min(1, over.shape[1] - 1) :].mean(axis=1))
+    return found
+
+
+def lines(metrics: Mapping[str, np.ndarray], agents: Sequence[str], rollouts: int) -> list[str]:
+    """The last evaluation of each agent's critics, for the terminal."""
+    seeds = len(np.unique(metrics["seed"]))
+    over = f"95 % interval over {seeds} seeds" if seeds > 1 else f"95 % interval over {rollouts} rollouts"
+    found = [f"critics at the last evaluation ({rollouts} rollouts of each seed, {over}):"]
+    for agent, finals in summary(metrics, agents).items():
+        (estimate, _), (truth, _), (mean, half) = (finals[n] for n in ("q_estimate", "q_true", "overestimation"))
+        if half is None:
+            half = by_seed(metrics, f"{agent}_overestimation_interval")[1][0, -1] if rollouts > 1 else math.nan
+        found.append(f"  {agent}: estimate {estimate:.4g}, truth {truth:.4g}, overestimation {mean:.4g} ± {half:.2g}")
+    return found
+
+
+def draw(path: Path, metrics: Mapping[str, np.ndarray], teams: Mapping[str, Sequence[str]], title: str) -> None:
+    """One column for each team: above, its agents' mean estimated and true values over env steps, each the mean over
+    seeds with its 95 % interval; below, their overestimation, each agent's and the mean with its interval.
+
+    Args:
+        metrics: columns [rows] of the metrics table.
+        teams: names of each team's agents.
+    """
+    figure = Figure(figsize=(1.5 + 5.5 * len(teams), 6.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(2, len(teams), sharex=True, squeeze=False)
+    seeds = len(np.unique(metrics["seed"]))
+    who = f"mean of {seeds} seeds, 95 % interval" if seeds > 1 else "one seed"
+    for (values, bias), (team, agents) in zip(axes.T, teams.items(), strict=True):
+        steps, truth = team_values(metrics, agents, "q_true")
+        estimate, over = (team_values(metrics, agents, name)[1] for name in ("q_estimate", "overestimation"))
+        _line(values, steps, estimate, AGENT[0], "estimate of the critics")
+        _line(values, steps, truth, AGENT[1], "true value of the policies", dashed=True)
+        for k, agent in enumerate(agents if len(agents) > 1 else ()):
+            each = by_seed(metrics, f"{agent}_overestimation")[1].mean(axis=0)
+            colour = _hex(AGENT[(k + 2) % len(AGENT)])
+            bias.plot(steps, each, color=colour, linewidth=1, label=agent)
+        _line(bias, steps, over, BLACK, f"mean of the {len(agents)} agents" if len(agents) > 1 else agents[0])
+        bias.axhline(0, color="gray", linewidth=0.8)
+        values.set_title(team if len(teams) > 1 else "")
+        values.set_ylabel("discounted return" + (f", mean of {len(agents)} agents" if len(agents) > 1 else ""))
+        bias.set_ylabel("overestimation (estimate - truth)")
+        bias.set_xlabel("env steps of each seed")
+        for axis in (values, bias):
+            axis.legend(frameon=False)
+    figure.suptitle(f"{title}; {who}")
+    figure.savefig(path, dpi=120)
+
+
+def team_values(metrics: Mapping[str, np.ndarray], agents: Sequence[str], name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Env steps [evaluations] and the mean over `agents` of one of `COLUMNS`, [seeds, evaluations]."""
+    steps = by_seed(metrics, f"{agents[0]}_{name}")[0]
+    return steps, np.mean([by_seed(metrics, f"{agent}_{name}")[1] for agent in agents], axis=0)
+
+
+def _line(axis, steps: np.ndarray, curves: np.ndarray, colour: Colour, label: str, dashed: bool = False) -> None:
+    curve(axis, steps, curves, _hex(colour), label)
+    line = axis.lines[-1]
+    line.set(label=label, linewidth=1.8, linestyle="--" if dashed else "-")
+    if len(steps) == 1:
+        line.set_marker("o")
+
+
+def _hex(colour: Colour) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*colour)
+
+
+def _final(values: np.ndarray) -> Final:
+    mean, half = mean_interval(values)
+    return float(mean), float(half) if len(values) > 1 else None
