@@ -125,7 +125,7 @@ def open_sweep(folder: Path) -> tuple[Sweep, dict[str, Any]]:
 
 
 def _train(sweep: Sweep, piece: int | None, facts: Mapping[str, Any]) -> int:
-    code = sweep.train(piece)
+    code = sweep.train(None if piece is None else [piece])
     if code:
         print(f"stopped; go on with: python -m matd3_jax.sweep resume={sweep.folder}")
         return code

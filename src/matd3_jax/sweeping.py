@@ -9,7 +9,7 @@ import fcntl
 import json
 import shutil
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -66,13 +66,13 @@ class Sweep:
         """Whether all runs of a piece are."""
         return all((self.runs / name / "summary.json").exists() for name in self.pieces[piece])
 
-    def train(self, only: int | None = None, stop: Stop | None = None) -> int:
-        """Train the unfinished pieces, or the one numbered `only`: the exit code, 0 or 128 + the signal that ended it.
+    def train(self, only: Collection[int] | None = None) -> int:
+        """Train the unfinished pieces, or those of `only`: the exit code, 0 or 128 + the signal that ended it.
 
         Pieces at which another process works are passed over.
         """
-        stop = stop or Stop()
-        todo = [k for k in range(len(self.pieces)) if not self.finished(k) and only in (None, k)]
+        stop = Stop()
+        todo = [k for k in range(len(self.pieces)) if not self.finished(k) and (only is None or k in only)]
         for k in todo:
             with self._taken(k) as mine:
                 if not mine:
@@ -189,8 +189,9 @@ def train(settings: Mapping[str, Config], folder: Path, budget: int | None = Non
     """
     sweep = Sweep(folder)
     runs = sweep.add(settings, budget)
-    wanted: Sequence[Path] = [path for paths in runs.values() for path in paths]
-    code = sweep.train()
+    wanted = [path for paths in runs.values() for path in paths]
+    names = {path.name for path in wanted}
+    code = sweep.train([k for k, piece in enumerate(sweep.pieces) if names & set(piece)])
     unfinished = [path for path in wanted if not (path / "summary.json").exists()]
     if unfinished and not code:
         raise UserError(
