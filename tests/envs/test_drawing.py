@@ -13,6 +13,7 @@ from matd3_jax.envs.point import PointState
 SIDE = 300
 TASKS = (
     "simple_spread", "simple_speaker_listener", "simple_crypto", "simple_push", "simple_adversary", "simple_tag",
+    "simple", "simple_reference", "simple_world_comm",
 )  # fmt: skip
 
 
