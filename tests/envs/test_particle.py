@@ -95,7 +95,7 @@ def test_sizes_and_spaces(name, rules):
         assert (team == "adversaries") == agent.startswith(("adversary", "leadadversary", "eve"))
 
 
-@pytest.mark.parametrize("name", ["simple_spread", "simple_speaker_listener", "simple_tag", "simple_world_comm"])
+@pytest.mark.parametrize("name", ["simple_spread", "simple_speaker_listener", "simple_tag", "simple_reference"])
 def test_single_equals_vmap_and_full_observation(name):
     env, key = make(name), jax.random.key(1)
     keys = jax.random.split(key)
