@@ -14,6 +14,8 @@ PURPLE: Colour = (204, 121, 167)
 ORANGE: Colour = (230, 159, 0)
 SKY_BLUE: Colour = (86, 180, 233)
 YELLOW: Colour = (240, 228, 66)
+PALE_GREEN: Colour = (166, 219, 203)
+"""Green mixed with white, for what lies under everything else."""
 
 TEAM: dict[str, Colour] = {"agents": BLUE, "adversaries": VERMILION}
 """Where teams matter."""

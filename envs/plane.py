@@ -19,8 +19,9 @@ OPACITY = 205
 
 LABEL = 1.3
 """Height of a label, in sizes of its typeface."""
-BAR, CHART = 0.03, 0.1
-"""Width of a message's bars and their greatest height, as fractions of the picture's side."""
+BAR, CHART, WIDEST_CHART = 0.03, 0.1, 0.2
+"""Width of a message's bars, their greatest height, and the most that all bars of a message take, as fractions of the
+picture's side."""
 
 GRID: Colour = (236, 236, 236)
 START: Colour = (190, 190, 190)
@@ -42,7 +43,7 @@ class Disc:
     ringed: bool = False
     """With a ring around it, to stand out by shape as well."""
     message: np.ndarray | None = None
-    """[frames, entries] between 0 and 1: a bar for each entry, beside the place of the first frame."""
+    """[frames, entries] between 0 and 1: a bar for each entry, beside the disc."""
     marked: int | None = None
     """The entry of the message that is green."""
 
@@ -110,7 +111,7 @@ class _Painter:
         for disc in self.scene.discs:
             self._label(pen, disc, frame)
             if disc.message is not None:
-                _chart(pen, disc.message[frame], disc.marked, self._chart_box(disc, disc.message.shape[1]))
+                _chart(pen, disc.message[frame], disc.marked, self._chart_box(disc, frame))
         if self.scene.note:
             pen.text((4, self.side - 4), self.scene.note, fill=BLACK, font=self.font, anchor="ls")
         return picture
@@ -166,11 +167,13 @@ class _Painter:
         """There is room for it there."""
         return self.pixel(disc.place(frame))[1] + self.radius(disc) + LABEL * self.font.size < self.side
 
-    def _chart_box(self, disc: Disc, entries: int) -> Edges:
+    def _chart_box(self, disc: Disc, frame: int) -> Edges:
         """Where a message goes: above its disc, or below the label where there is no room above. In the picture."""
-        x, y = self.pixel(disc.place(0))
-        width, height, label = BAR * self.side * entries, CHART * self.side, LABEL * self.font.size
-        bottom = y - self.radius(disc) - 5 - (0 if self._label_below(disc, 0) else label)
+        assert disc.message is not None
+        x, y = self.pixel(disc.place(frame))
+        width = min(BAR * disc.message.shape[1], WIDEST_CHART) * self.side
+        height, label = CHART * self.side, LABEL * self.font.size
+        bottom = y - self.radius(disc) - 5 - (0 if self._label_below(disc, frame) else label)
         if bottom - height < 3:
             bottom = y + self.radius(disc) + label + 5 + height
         left = np.clip(x - width / 2, 3, self.side - width - 3)

@@ -99,6 +99,14 @@ CASES = {
     "iddpg": Case("simple_push", "iddpg", shared=True),
     "td3": Case("simple_spread", "td3"),
     "ddpg": Case("simple_speaker_listener", "ddpg"),
+    # Agents that move and speak: a movement and a word each, soft and hard.
+    "speaking": Case("simple_reference", "matd3", one_by_one=False),
+    "speaking-hard": Case(
+        "simple_world_comm",
+        "iltd3",
+        "maddpg",
+        options={"actions": "discrete", "num_adversaries": 2, "num_good": 1, "num_food": 1, "num_forests": 0},
+    ),
     # Teams of different algorithms.
     "matd3-maddpg": Case("simple_tag", "matd3", "maddpg", still=("agents",)),
     "matd3-iltd3": Case("simple_adversary", "matd3", "iltd3", sequential=True),

@@ -11,7 +11,7 @@ from matd3_jax.envs import Box, Discrete, MultiDiscrete, Simplex
 
 TOLERANCE = 1e-12  # float64 on both sides; only the order of sums of up to ten terms differs
 BOX = Box(2, -1.0, 3.0)
-CHOICES = (Simplex((5,)), Simplex((3, 2)), Discrete(4), MultiDiscrete((2, 3)))
+CHOICES = (Simplex((5,)), Simplex((3, 2)), Simplex((5, 10)), Discrete(4), MultiDiscrete((2, 3)))
 
 pytestmark = pytest.mark.usefixtures("quick_jit")
 

@@ -13,7 +13,10 @@ from matd3_jax.envs.joint import JointTeam
 from matd3_jax.spec import Spec
 
 MATD3, MADDPG = Algorithm(), Algorithm(name="maddpg", num_critics=1, policy_delay=1)
-TASKS = ("simple_spread", "simple_speaker_listener", "simple_crypto", "simple_push", "simple_adversary", "simple_tag")
+TASKS = (
+    "simple_spread", "simple_speaker_listener", "simple_crypto", "simple_push", "simple_adversary", "simple_tag",
+    "simple_reference", "simple_world_comm",
+)  # fmt: skip
 
 
 def environments():
@@ -24,6 +27,7 @@ def environments():
             yield JointTeam(env, team)
     yield make("point_reach")
     yield JointTeam(make("simple_spread", actions="discrete"))
+    yield JointTeam(make("simple_world_comm", actions="discrete"), "adversaries")
 
 
 ENVIRONMENTS = tuple(environments())

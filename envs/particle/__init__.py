@@ -1,1 +1,1 @@
-"""The six particle tasks of MADDPG and MATD3: `world` is the physics, `task` what all share, then one file a task."""
+"""The particle tasks of MADDPG and MATD3: `world` is the physics, `task` what all share, then one file a task."""

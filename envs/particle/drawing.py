@@ -4,35 +4,47 @@ from collections import Counter
 
 import numpy as np
 
-from ..colours import DARK_GREY, GREEN, GREY, PURPLE, TEAM, Colour
+from ..colours import DARK_GREY, GREEN, GREY, PALE_GREEN, PURPLE, TEAM, YELLOW, Colour
 from ..plane import Disc, Scene
 from .task import ParticleTask
 from .world import State
+
+LANDMARK: dict[str, Colour] = {
+    "landmark": GREY,
+    "obstacle": DARK_GREY,
+    "goal": GREEN,
+    "food": YELLOW,
+    "forest": PALE_GREEN,
+}
 
 
 def scene(env: ParticleTask, states: State) -> Scene:
     """The episode of `states`, every leaf with a leading axis [frames].
 
-    Landmarks are grey, the goal among them green and ringed; obstacles, which agents bump into, are dark. Who speaks
-    has a bar for each entry of the message. In simple_crypto goal and key are codes: the entry that stands for the goal
-    is green in everybody's message. Places mean nothing there: agents stand apart instead, and landmarks are left out.
+    Landmarks are grey, the goal among them green and ringed; obstacles, which agents bump into, are dark, food is
+    yellow, forests, under everything else, are pale green. Who speaks has a bar for each entry of the message. In
+    simple_reference each goal bears the numbers of those that should go there. In simple_crypto goal and key are codes:
+    the entry that stands for the goal is green in everybody's message. Places mean nothing there: agents stand apart
+    instead, and landmarks are left out.
     """
     world = env.world
     pos, landmark = np.asarray(states.pos), np.asarray(states.landmark)[0]
     comm = None if states.comm is None else np.asarray(states.comm)
-    goal = None if states.goal is None else int(states.goal[0])
+    goals = [] if states.goal is None else np.atleast_1d(np.asarray(states.goal[0])).tolist()
     discs, note = [], ""
     if states.key is None:
-        for i, (radius, solid) in enumerate(zip(world.landmark_radius, world.landmark_collide, strict=True)):
-            colour = GREEN if i == goal else DARK_GREY if solid else GREY
-            discs.append(Disc(landmark[i], radius, colour, ringed=i == goal))
+        kinds = ["goal" if i in goals else kind for i, kind in enumerate(env.landmark_kinds)]
+        for i in sorted(range(len(kinds)), key=lambda i: -world.landmark_radius[i]):
+            # Two goals: each is its owner's word to the other one.
+            label = " ".join(str(1 - k) for k in (1, 0) if goals[k] == i) if env.goal_shape else ""
+            discs.append(Disc(landmark[i], world.landmark_radius[i], LANDMARK[kinds[i]], label, kinds[i] == "goal"))
     else:
         angle = 2 * np.pi * np.arange(len(env.agents)) / len(env.agents) - np.pi / 2
         pos = np.broadcast_to(0.6 * np.stack([np.cos(angle), np.sin(angle)], axis=1), pos.shape)
-        note = f"code to tell: {goal}, key: {int(states.key[0])}"
+        note = f"code to tell: {goals[0]}, key: {int(states.key[0])}"
     for i, label in enumerate(_labels(env.agents)):
-        message = None if comm is None or world.movable[i] else comm[:, i]
-        marked = None if states.key is None else goal
+        message = None if comm is None or not env.speaks[i] else comm[:, i]
+        marked = None if states.key is None else goals[0]
         discs.append(Disc(pos[:, i], world.radius[i], TEAM[env.teams[i]], label, message=message, marked=marked))
     return Scene(discs, note)
 
@@ -44,18 +56,16 @@ def legend(env: ParticleTask) -> tuple[tuple[str, Colour], ...]:
         shown[_kind(agent)] = TEAM[team]
     if env.num_goals:
         shown["code" if env.num_keys else "goal"] = GREEN
-    world = env.world
-    if any(world.landmark_collide):
-        shown["obstacle"] = DARK_GREY
-    elif world.landmark_radius and not env.num_keys:
-        shown["landmark"] = GREY
+    if not env.num_keys:
+        shown |= {kind: LANDMARK[kind] for kind in env.landmark_kinds}
     if env.dim_c:
         shown["message"] = PURPLE
     return tuple(shown.items())
 
 
 def _kind(agent: str) -> str:
-    return agent.rsplit("_", 1)[0]
+    kind = agent.rsplit("_", 1)[0]
+    return "leader" if kind == "leadadversary" else kind
 
 
 def _labels(agents: tuple[str, ...]) -> list[str]:

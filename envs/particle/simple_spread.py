@@ -5,8 +5,8 @@ import dataclasses
 import chex
 import jax.numpy as jnp
 
-from ..base import OptionError, check_count
-from .task import ParticleTask
+from ..base import check_count
+from .task import ParticleTask, check_local_ratio
 from .world import State, World, distance_of, others, relative
 
 AGENT_RADIUS = 0.15
@@ -34,12 +34,7 @@ class SimpleSpread(ParticleTask):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_count("num_agents", self.num_agents, 1)
-        if self.local_ratio is not None:
-            if self.rules != "mpe2":
-                raise OptionError(f"local_ratio={self.local_ratio!r}: only rules='mpe2' have it; leave it out")
-            number = isinstance(self.local_ratio, int | float) and not isinstance(self.local_ratio, bool)
-            if not number or not 0 <= self.local_ratio <= 1:
-                raise OptionError(f"local_ratio={self.local_ratio!r}: must be a number between 0 and 1")
+        check_local_ratio(self.local_ratio, self.rules)
 
     @property
     def agents(self) -> tuple[str, ...]:

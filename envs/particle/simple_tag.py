@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from ..base import check_count
 from .task import ParticleTask
-from .world import State, World, distance_of, others, relative
+from .world import State, World, distance_of, others, outside, relative
 
 PREDATOR_RADIUS, PREY_RADIUS, OBSTACLE_RADIUS = 0.075, 0.05, 0.2
 CAPTURE = 10.0
@@ -92,10 +92,4 @@ class SimpleTag(ParticleTask):
         touching = distance_of(relative(prey, predators)) < PREDATOR_RADIUS + PREY_RADIUS
         captures = CAPTURE * jnp.sum(touching.astype(prey.dtype), axis=1)
         shared = jnp.full(self.num_adversaries, jnp.sum(captures))
-        return jnp.concatenate([shared, -captures - jnp.sum(_beyond(jnp.abs(prey)), axis=1)])
-
-
-def _beyond(z: chex.Array) -> chex.Array:
-    """What a prey pays for a coordinate of size `z`: nothing within 0.9, up to 10 far outside."""
-    outside = jnp.minimum(jnp.exp(jnp.minimum(2 * z - 2, 3)), 10)  # exp(3) > 10; beyond it might overflow
-    return jnp.where(z < 0.9, 0, jnp.where(z < 1, 10 * (z - 0.9), outside))
+        return jnp.concatenate([shared, -captures - outside(prey)])

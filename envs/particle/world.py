@@ -29,7 +29,7 @@ class State(NamedTuple):
     landmark: chex.Array
     """[L, 2] positions of the landmarks, which never move."""
     goal: chex.Array | None
-    """int32 scalar: index of the goal landmark, or of the goal code."""
+    """int32 scalar: index of the goal landmark, or of the goal code. [2] in simple_reference: see there."""
     key: chex.Array | None
     """int32 scalar: index of the cryptographic key."""
     step: chex.Array
@@ -98,12 +98,13 @@ class World:
 
         Entities at exactly the same place push each other nowhere (the original divides by zero there).
         """
-        landmarks_too = any(self.landmark_collide)
-        touch = np.outer(self.collide, self.collide + (self.landmark_collide if landmarks_too else ()))
+        # Landmarks behind the last solid one are left out.
+        solid = max((i + 1 for i, collides in enumerate(self.landmark_collide) if collides), default=0)
+        touch = np.outer(self.collide, self.collide + self.landmark_collide[:solid])
         if not touch.any():
             return None
-        other = jnp.concatenate([pos, landmark]) if landmarks_too else pos
-        radius = self.radius + (self.landmark_radius if landmarks_too else ())
+        other = jnp.concatenate([pos, landmark[:solid]]) if solid else pos
+        radius = self.radius + self.landmark_radius[:solid]
         reach = _constant(np.add.outer(self.radius, radius), pos)
         delta = pos[:, None] - other[None]
         # Squares that are zero, the agent beside itself among them, become 1: no contact, finite slope, and delta is 0.
@@ -165,13 +166,20 @@ def others(pairs: chex.Array) -> chex.Array:
 
 
 def choose(index: chex.Array, rows: chex.Array) -> chex.Array:
-    """`rows[index]` of [k, d] as a product with a one-hot vector, which is cheaper than a batched gather."""
-    return jnp.sum(one_hot(index, rows.shape[0], rows.dtype)[:, None] * rows, axis=0)
+    """`rows[index]` [..., d] of rows [k, d] and index [...]: products with one-hot vectors, cheaper than a gather."""
+    return jnp.sum(one_hot(index, rows.shape[0], rows.dtype)[..., None] * rows, axis=-2)
 
 
 def one_hot(index: chex.Array, size: int, dtype: chex.ArrayDType) -> chex.Array:
     """[..., size] with a 1 at `index` [...], zeros elsewhere."""
     return (index[..., None] == jnp.arange(size)).astype(dtype)
+
+
+def outside(pos: chex.Array) -> chex.Array:
+    """What prey pays at `pos` [..., 2]: for each coordinate nothing within 0.9, up to 10 far outside. [...]."""
+    z = jnp.abs(pos)
+    beyond = jnp.minimum(jnp.exp(jnp.minimum(2 * z - 2, 3)), 10)  # exp(3) > 10; farther out it might overflow
+    return jnp.sum(jnp.where(z < 0.9, 0, jnp.where(z < 1, 10 * (z - 0.9), beyond)), axis=-1)
 
 
 def _constant(values: object, like: chex.Array) -> chex.Array:

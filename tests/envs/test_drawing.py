@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from matd3_jax.envs import OptionError, make, plane, point_drawing
-from matd3_jax.envs.colours import BLUE, DARK_GREY, GREEN, GREY, PURPLE, VERMILION
+from matd3_jax.envs.colours import BLUE, DARK_GREY, GREEN, GREY, PALE_GREEN, PURPLE, VERMILION, YELLOW
 from matd3_jax.envs.particle import drawing
 from matd3_jax.envs.point import PointState
 
 SIDE = 300
 TASKS = (
     "simple_spread", "simple_speaker_listener", "simple_crypto", "simple_push", "simple_adversary", "simple_tag",
+    "simple", "simple_reference", "simple_world_comm",
 )  # fmt: skip
 
 
@@ -123,6 +124,52 @@ def test_a_speaker_shows_each_entry_of_its_message():
     assert silent < half < one < all_
     assert all_ - silent == pytest.approx(3 * (one - silent), rel=0.15)  # widths differ by a pixel
     assert half - silent == pytest.approx((one - silent) / 2, rel=0.1)
+
+
+def test_a_walking_speaker_takes_its_message_along():
+    """The leader goes from left to right; its chart stays above it and the silent ones have none."""
+    env = make("simple_world_comm")
+    n = len(env.agents)
+    states = still(env, frames=2, comm=np.ones((n, 4)), landmark=[[0.9, -0.9]] * 5)
+    pos = np.full((2, n, 2), -0.9)
+    pos[:, 0] = [[-0.5, 0.3], [0.5, 0.3]]
+    for place, image in zip(pos[:, 0], draw(env, states._replace(pos=jnp.asarray(pos))), strict=True):
+        rows, columns = np.nonzero(close(image, PURPLE, 10))
+        half, centre = plane_of(env, states._replace(pos=jnp.asarray(pos)))
+        row, column = at(place, half, centre)
+        assert rows.max() < row and columns.mean() == pytest.approx(column, abs=2)
+        assert columns.max() - columns.min() == pytest.approx(4 * 0.03 * SIDE, abs=4)
+
+
+def test_a_long_message_is_no_wider_than_a_fifth_of_the_picture():
+    env = make("simple_reference")
+    image = messages(env, np.concatenate([np.ones((1, 10)), np.zeros((1, 10))]), pos=[[-0.5, 0.0], [0.5, 0.0]])
+    left = np.nonzero(close(image[:, : SIDE // 2], PURPLE, 10))[1]
+    assert left.max() - left.min() == pytest.approx(0.2 * SIDE, abs=4)
+
+
+@pytest.mark.parametrize(("goal", "labels"), [([2, 0], ["0", "", "1"]), ([1, 1], ["", "0 1", ""])])
+def test_goals_bear_the_numbers_of_those_that_should_go_there(goal, labels):
+    """In simple_reference goal[0] is agent 1's and goal[1] is agent 0's."""
+    env = make("simple_reference")
+    discs = drawing.scene(env, still(env, goal=goal)).discs[:3]
+    assert [disc.label for disc in discs] == labels
+    assert [disc.ringed for disc in discs] == [bool(label) for label in labels]
+    assert [disc.colour for disc in discs] == [GREEN if label else GREY for label in labels]
+
+
+def test_food_in_a_forest_is_seen_and_so_is_who_hides_there():
+    """Whatever the order of landmarks, forests lie lowest."""
+    env = make("simple_world_comm")
+    landmark = [[-0.6, -0.6], [0.5, 0.6], [0.6, -0.6], [0.5, 0.5], [-0.5, 0.6]]
+    pos = [[-0.9, 0.0], [-0.3, 0.0], [0.0, 0.0], [0.3, 0.0], [0.5, 0.4], [0.9, 0.0]]
+    image = draw(env, still(env, landmark=landmark, pos=pos))[0]
+    half, centre = plane_of(env, still(env, landmark=landmark, pos=pos))
+    for place, colour in (
+        ([-0.6, -0.6], DARK_GREY), ([0.5, 0.6], YELLOW), ([0.6, -0.6], YELLOW), ([0.3, 0.5], PALE_GREEN),
+        ([-0.5, 0.6], PALE_GREEN), ([0.47, 0.4], BLUE),
+    ):  # fmt: skip
+        assert close(image[at(place, half, centre)], colour, 45), place
 
 
 def test_silent_agents_show_no_message():

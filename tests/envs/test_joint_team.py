@@ -88,6 +88,25 @@ def test_one_team_of_two():
     np.testing.assert_allclose(got.observation[3], np.concatenate(want.observation[3:]), atol=1e-6)
 
 
+@pytest.mark.parametrize("actions", ["soft", "discrete", "continuous"])
+def test_a_team_of_which_one_speaks(actions):
+    """The leader's movement and word come first in the joined action, then the others' movements."""
+    env = make("simple_world_comm", num_adversaries=2, num_good=1, rules="mpe2", actions=actions)
+    joint = JointTeam(env, "adversaries")
+    space = {"soft": Simplex((5, 4, 5)), "discrete": MultiDiscrete((5, 4, 5)), "continuous": Box(14, 0.0, 1.0)}[actions]
+    assert joint.action_spaces[0] == space and joint.observation_sizes == (2 * (14 + 4 + 2 + 2 + 4), 18 + 2)
+    state, _ = jax.jit(env.reset)(jax.random.key(0))
+    action = sample(env, jax.random.key(1))
+    joined = jnp.concatenate([jnp.atleast_1d(a) for a in action[:2]])
+    assert joined.shape == space.shape
+    want = jax.jit(env.step)(None, state, action)
+    got = jax.jit(joint.step)(None, state, (joined, action[2]))
+    np.testing.assert_allclose(got.state.vel, want.state.vel, atol=1e-6)
+    np.testing.assert_array_equal(got.state.comm, want.state.comm)
+    np.testing.assert_allclose(got.observation[0], np.concatenate(want.observation[:2]), atol=1e-6)
+    np.testing.assert_allclose(got.reward, [want.reward[:2].mean(), want.reward[2]], rtol=1e-6)
+
+
 def test_both_teams():
     joint = JointTeam(make("simple_push"), ("agents", "adversaries"))
     assert joint.agents == ("agents+adversaries",) and joint.action_spaces == (Simplex((5, 5)),)

@@ -37,6 +37,9 @@ def test_agents():
         "simple_push": ("adversary_0", "agent_0"),
         "simple_adversary": ("adversary_0", "agent_0", "agent_1"),
         "simple_tag": ("adversary_0", "adversary_1", "adversary_2", "agent_0"),
+        "simple": ("agent_0",),
+        "simple_reference": ("agent_0", "agent_1"),
+        "simple_world_comm": ("leadadversary_0", "adversary_0", "adversary_1", "adversary_2", "agent_0", "agent_1"),
         "point_reach": ("agent_0", "agent_1"),
     }
     for name, expected in agents.items():
@@ -64,6 +67,11 @@ def test_agents():
         ("simple_spread", {"local_ratio": 1.5, "rules": "mpe2"}, ["local_ratio=1.5", "between 0 and 1"]),
         ("simple_spread", {"local_ratio": "half", "rules": "mpe2"}, ["local_ratio='half'", "between 0 and 1"]),
         ("simple_spread", {"local_ratio": float("nan"), "rules": "mpe2"}, ["local_ratio=nan"]),
+        ("simple_reference", {"local_ratio": 0.5}, ["local_ratio=0.5", "rules='mpe2'"]),
+        ("simple_reference", {"local_ratio": -1, "rules": "mpe2"}, ["local_ratio=-1", "between 0 and 1"]),
+        ("simple_world_comm", {"num_adversaries": 0}, ["num_adversaries=0", "at least 1"]),
+        ("simple_world_comm", {"num_food": 0}, ["num_food=0", "at least 1"]),
+        ("simple_world_comm", {"num_forests": -1}, ["num_forests=-1", "at least 0"]),
         ("simple_adversary", {"num_good": -1}, ["num_good=-1", "at least 1"]),
         ("simple_tag", {"num_good": 0}, ["num_good=0"]),
         ("simple_tag", {"num_adversaries": 0}, ["num_adversaries=0"]),

@@ -7,15 +7,17 @@ from mpe2 import (
     simple_adversary_v3,
     simple_crypto_v3,
     simple_push_v3,
+    simple_reference_v3,
     simple_speaker_listener_v4,
     simple_spread_v3,
     simple_tag_v3,
+    simple_v3,
+    simple_world_comm_v3,
 )
+from particle_cases import NUM_STATES, random_actions, random_states
 
-from matd3_jax.envs import make
-from matd3_jax.envs.particle.world import State
+from matd3_jax.envs import MultiDiscrete, make
 
-NUM_STATES = 250  # as many as a recording has, so that both share a compiled program
 TASKS = [
     # name, mpe2's module, our options, the same options in mpe2's words
     ("simple_spread", simple_spread_v3, {}, {}),
@@ -31,6 +33,17 @@ TASKS = [
         simple_tag_v3,
         {"num_good": 3, "num_adversaries": 2, "num_obstacles": 1},
         {"num_good": 3, "num_adversaries": 2, "num_obstacles": 1},
+    ),
+    ("simple", simple_v3, {}, {}),
+    ("simple_reference", simple_reference_v3, {}, {}),
+    ("simple_reference", simple_reference_v3, {"local_ratio": 0.2}, {"local_ratio": 0.2}),
+    ("simple_world_comm", simple_world_comm_v3, {}, {}),
+    *(
+        ("simple_world_comm", simple_world_comm_v3, options, options)
+        for options in (
+            {"num_good": 3, "num_adversaries": 2, "num_obstacles": 2, "num_food": 1, "num_forests": 3},
+            {"num_good": 1, "num_adversaries": 1, "num_obstacles": 0, "num_food": 3, "num_forests": 0},
+        )
     ),
 ]
 
@@ -48,41 +61,16 @@ class Draws:
         return np.zeros(size)
 
 
-def random_states(env, rng):
-    """Spread over the plane (reaching beyond the unit square), crowded, and piled up; some faster than any limit."""
-    n, num_landmarks = len(env.agents), len(env.world.landmark_radius)
-    scale = rng.choice([1.5, 0.4, 0.1], (NUM_STATES, 1, 1))
-    centre = rng.uniform(-1, 1, (NUM_STATES, 1, 2))
-    place = centre + scale * rng.uniform(-1, 1, (NUM_STATES, n + num_landmarks, 2))
-    movable = np.array(env.world.movable)
-    comm = None
-    if env.dim_c:
-        comm = rng.uniform(0, 1, (NUM_STATES, n, env.dim_c)) * ~movable[:, None]
-        comm *= rng.uniform(size=(NUM_STATES, n, 1)) > 0.2
-    return State(
-        pos=place[:, :n],
-        vel=rng.normal(0, 0.7, (NUM_STATES, n, 2)) * movable[:, None],
-        comm=comm,
-        landmark=place[:, n:],
-        goal=rng.integers(env.num_goals, size=NUM_STATES, dtype=np.int32) if env.num_goals else None,
-        key=rng.integers(env.num_keys, size=NUM_STATES, dtype=np.int32) if env.num_keys else None,
-        step=rng.integers(25, size=NUM_STATES, dtype=np.int32),
-    )
-
-
-def random_actions(env, rng):
-    if env.actions == "discrete":
-        return tuple(rng.integers(space.n, size=NUM_STATES, dtype=np.int32) for space in env.action_spaces)
-    # Partly outside [0, 1], where mpe2's wrapper clips; partly zero, for silence in simple_crypto.
-    shapes = [(NUM_STATES, space.size) for space in env.action_spaces]
-    return tuple(rng.uniform(-0.3, 1.3, shape) * (rng.uniform(size=(NUM_STATES, 1)) > 0.1) for shape in shapes)
+def mpe2_action(space, action):
+    """Movement and word as the one number that mpe2 takes for both."""
+    return action[0] + space.sizes[0] * action[1] if isinstance(space, MultiDiscrete) else action
 
 
 def mpe2_step(parallel, env, state, action):
     """What mpe2 shows in `state`, and everything after one step from there."""
     raw = parallel.unwrapped
     parallel.reset()
-    drawn = [value for value in (state.goal, state.key) if value is not None]
+    drawn = [index for value in (state.goal, state.key) if value is not None for index in np.ravel(value)]
     raw.scenario.reset_world(raw.world, Draws(drawn))
     raw.steps = int(state.step)
     for i, agent in enumerate(raw.world.agents):
@@ -92,7 +80,9 @@ def mpe2_step(parallel, env, state, action):
     for i, landmark in enumerate(raw.world.landmarks):
         landmark.state.p_pos = state.landmark[i].copy()
     seen = [raw.observe(name) for name in env.agents]
-    observation, reward, terminated, truncated, _ = parallel.step(dict(zip(env.agents, action, strict=True)))
+    action = dict(zip(env.agents, map(mpe2_action, env.action_spaces, action), strict=True))
+    assert all(map(np.array_equal, map(np.shape, action.values()), (parallel.action_space(a).shape for a in action)))
+    observation, reward, terminated, truncated, _ = parallel.step(action)
     agents = raw.world.agents
     return {
         "seen": seen,
@@ -135,6 +125,7 @@ def test_steps(task, actions, observe_and_step):
     assert not ts.terminated.any() and not want["terminated"].any()
     np.testing.assert_array_equal(ts.truncated, want["truncated"])
     assert want["truncated"].any() and not want["truncated"].all()
-    if any(env.world.movable):  # contacts were put to the test
+    assert [world_agent.silent for world_agent in parallel.unwrapped.world.agents] == [not s for s in env.speaks]
+    if any(env.world.movable) and len(env.agents) > 1:  # contacts were put to the test
         gap = np.linalg.norm(state.pos[:, :, None] - state.pos[:, None], axis=-1) + 9 * np.eye(len(env.agents))
         assert (gap < np.add.outer(env.world.radius, env.world.radius)).any(axis=(1, 2)).sum() > 30

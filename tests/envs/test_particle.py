@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from matd3_jax.envs import Box, Discrete, Simplex, make
+from matd3_jax.envs import Box, Discrete, MultiDiscrete, Simplex, make
 from matd3_jax.envs.particle.world import choose, others, softplus
 
 TASKS = (
@@ -18,6 +18,9 @@ TASKS = (
     "simple_push",
     "simple_adversary",
     "simple_tag",
+    "simple",
+    "simple_reference",
+    "simple_world_comm",
 )
 
 
@@ -31,7 +34,10 @@ def test_reset_distribution(name):
     """Uniform places (mean, variance and range), uniform independent goals and keys, all at rest."""
     env, n = make(name), 6000
     state, observation = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(3), n))
-    for place, bound in ((state.pos, 1.0), (state.landmark, 0.9 if name == "simple_tag" else 1.0)):
+    for place, bound in (
+        (state.pos, 1.0),
+        (state.landmark, 0.9 if name in ("simple_tag", "simple_world_comm") else 1.0),
+    ):
         place = np.asarray(place, np.float64)
         assert np.abs(place).max() <= bound and np.abs(place).max() > 0.99 * bound
         # Standard errors of mean and mean square of a uniform variable on [-b, b]; 5 of them over some 20 columns.
@@ -45,11 +51,15 @@ def test_reset_distribution(name):
     for index, count in ((state.goal, env.num_goals), (state.key, env.num_keys)):
         assert (index is None) == (count == 0)
         if index is not None:
-            share = np.bincount(index, minlength=count) / n
-            assert share.shape == (count,) and np.abs(share - 1 / count).max() < 5 * np.sqrt(0.25 / n)
+            assert index.shape == (n, *env.goal_shape)
+            for one in np.reshape(index, (n, -1)).T:
+                share = np.bincount(one, minlength=count) / n
+                assert share.shape == (count,) and np.abs(share - 1 / count).max() < 5 * np.sqrt(0.25 / n)
     if name == "simple_crypto":
         assert abs(np.corrcoef(state.goal, state.key)[0, 1]) < 5 / np.sqrt(n)
-    if name in ("simple_tag", "simple_crypto"):
+    if name == "simple_reference":
+        assert abs(np.corrcoef(np.transpose(state.goal))[0, 1]) < 5 / np.sqrt(n)
+    if name in ("simple_tag", "simple_crypto", "simple_reference"):
         # Not bit for bit: reset and observe are compiled apart and may round differently.
         chex.assert_trees_all_close(observation, jax.jit(jax.vmap(env.observe))(state), atol=1e-6)
 
@@ -64,23 +74,28 @@ def test_sizes_and_spaces(name, rules):
         "simple_push": ((8, 19), (5, 5)),
         "simple_adversary": ((8, 10, 10), (5, 5, 5)),
         "simple_tag": ((16, 16, 16, 14), (5, 5, 5, 5)),
+        "simple": ((4,), (5,)),
+        "simple_reference": ((21, 21), ((5, 10), (5, 10))),
+        "simple_world_comm": ((34, 34, 34, 34, 28, 28), ((5, 4), 5, 5, 5, 5, 5)),
     }
     sizes, choices = table[name]
     env = make(name, rules=rules)
     assert env.observation_sizes == sizes and env.full_observation_size == sum(sizes)
-    assert env.action_spaces == tuple(Simplex((n,)) for n in choices)
-    assert make(name, rules=rules, actions="discrete").action_spaces == tuple(Discrete(n) for n in choices)
+    parts = [n if isinstance(n, tuple) else (n,) for n in choices]
+    assert env.action_spaces == tuple(map(Simplex, parts))
+    discrete = tuple(MultiDiscrete(n) if isinstance(n, tuple) else Discrete(n) for n in choices)
+    assert make(name, rules=rules, actions="discrete").action_spaces == discrete
     boxes = tuple(
-        Box(2, -1.0, 1.0) if moves and rules == "orig" else Box(n, 0.0, 1.0)
-        for n, moves in zip(choices, env.world.movable, strict=True)
+        Box(2 + sum(n[1:]), -1.0, 1.0) if moves and rules == "orig" else Box(sum(n), 0.0, 1.0)
+        for n, moves in zip(parts, env.world.movable, strict=True)
     )
     assert make(name, rules=rules, actions="continuous").action_spaces == boxes
     assert len(env.teams) == len(env.agents) and env.return_weights == (1.0,) * len(env.agents)
     for agent, team in zip(env.agents, env.teams, strict=True):
-        assert (team == "adversaries") == agent.startswith(("adversary", "eve"))
+        assert (team == "adversaries") == agent.startswith(("adversary", "leadadversary", "eve"))
 
 
-@pytest.mark.parametrize("name", ["simple_spread", "simple_speaker_listener", "simple_tag"])
+@pytest.mark.parametrize("name", ["simple_spread", "simple_speaker_listener", "simple_tag", "simple_reference"])
 def test_single_equals_vmap_and_full_observation(name):
     env, key = make(name), jax.random.key(1)
     keys = jax.random.split(key)
@@ -183,8 +198,29 @@ def test_orig_actions_agree():
         np.testing.assert_array_equal(with_vector.state.comm, [words[word], np.zeros(3)])
 
 
+def test_orig_movers_that_speak():
+    """The three kinds of action of one that does both: same movement, same word."""
+    soft, discrete, box = (make("simple_reference", actions=a) for a in ("soft", "discrete", "continuous"))
+    state, _ = jax.jit(soft.reset)(jax.random.key(0))
+    steps = [jax.jit(env.step) for env in (soft, discrete, box)]
+    for move, entry, force in ((1, 2, [-1, 0]), (4, 3, [0, 1])):
+        for word in (0, 9):
+            said = jnp.eye(10)[word]
+            actions = (
+                jnp.concatenate([jnp.eye(5)[entry], said]),
+                jnp.array([move, word], jnp.int32),
+                jnp.concatenate([jnp.array(force), 2 * said - 1]),
+            )
+            still = (jnp.zeros(15), jnp.zeros(2, jnp.int32), jnp.array([0.0, 0.0] + [-1.0] * 10))
+            ends = [step(None, state, (a, s)) for step, a, s in zip(steps, actions, still, strict=True)]
+            for end in ends:
+                np.testing.assert_allclose(end.state.vel, [0.5 * np.array(force), [0, 0]], atol=1e-6)
+                np.testing.assert_array_equal(end.state.comm[0], said)
+                np.testing.assert_array_equal(end.observation[1][-10:], said)
+
+
 def test_mpe2_soft_is_its_continuous_action():
-    for name in ("simple_tag", "simple_speaker_listener"):
+    for name in ("simple_tag", "simple_speaker_listener", "simple_reference"):
         soft, box = (make(name, rules="mpe2", actions=a) for a in ("soft", "continuous"))
         state, _ = jax.jit(soft.reset)(jax.random.key(4))
         action = jax.jit(lambda key: sample(soft, key))(jax.random.key(5))  # noqa: B023
@@ -201,6 +237,10 @@ def test_mpe2_soft_is_its_continuous_action():
         ("simple_adversary", {"num_good": 1}),
         ("simple_tag", {"num_adversaries": 1, "num_good": 1, "num_obstacles": 0}),
         ("simple_tag", {"num_adversaries": 1, "num_good": 4, "num_obstacles": 5}),
+        ("simple_reference", {"rules": "mpe2", "local_ratio": 0, "actions": "discrete"}),
+        ("simple_world_comm", {"num_adversaries": 1, "num_good": 1, "num_obstacles": 0, "num_food": 1}),
+        ("simple_world_comm", {"num_forests": 0, "actions": "continuous"}),
+        ("simple_world_comm", {"num_adversaries": 2, "num_good": 3, "num_forests": 1, "actions": "discrete"}),
     ],
 )
 def test_smallest_and_odd_counts(name, options):
@@ -224,6 +264,7 @@ def test_helpers():
     rows = jnp.array([[1.5, -2.0], [0.1, 7.0], [3.0, 4.0]])
     for i in range(3):
         np.testing.assert_array_equal(choose(jnp.int32(i), rows), rows[i])
+    np.testing.assert_array_equal(choose(jnp.array([2, 0, 2]), rows), rows[jnp.array([2, 0, 2])])
     with jax.enable_x64(True):
         x = np.r_[np.linspace(-40, 40, 4001), -1e4, 1e4]
         np.testing.assert_allclose(softplus(jnp.asarray(x)), np.logaddexp(x, 0), rtol=0, atol=2e-13)

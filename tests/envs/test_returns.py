@@ -38,6 +38,10 @@ MEASURED = {
     ("simple_tag", "orig", "one-hot"): {0: (3.0, 0.3), 2: (3.0, 0.3), 3: (-14.5, 0.6)},
     ("simple_tag", "mpe2", "discrete"): {0: (4.9, 0.4), 2: (4.9, 0.4), 3: (-17.0, 0.8)},
     ("simple_tag", "mpe2", "continuous"): {0: (3.9, 0.4), 2: (3.9, 0.4), 3: (-11.2, 0.7)},
+    ("simple", "mpe2", "discrete"): {0: (-39.3, 1.4)},
+    ("simple_reference", "mpe2", "discrete"): {0: (-28.5, 0.4), 1: (-28.3, 0.4)},
+    ("simple_reference", "mpe2", "continuous"): {0: (-27.0, 0.4), 1: (-27.0, 0.4)},
+    ("simple_world_comm", "mpe2", "discrete"): {0: (3.1, 0.3), 3: (3.0, 0.3), 4: (-24.6, 1.4), 5: (-25.5, 1.3)},
 }
 
 
@@ -61,7 +65,10 @@ def random_actions(env, policy, rng):
     """Per agent [time, episode, ...]."""
     shape = (env.episode_length, NUM_EPISODES)
     if policy == "discrete":
-        return tuple(rng.integers(space.n, size=shape, dtype=np.int32) for space in env.action_spaces)
+        return tuple(
+            rng.integers(space.sizes, size=(*shape, len(space.sizes)), dtype=np.int32).reshape(*shape, *space.shape)
+            for space in env.action_spaces
+        )
     if policy == "continuous":
         return tuple(rng.uniform(size=(*shape, space.size)).astype(np.float32) for space in env.action_spaces)
     if policy == "one-hot":

@@ -1,0 +1,85 @@
+"""Agents that move and speak, through the whole loop: what they play, what the others hear, and that it is learnt."""
+
+import functools
+
+import jax
+import numpy as np
+import pytest
+import reference
+from learner_cases import layers
+
+import matd3_jax
+from matd3_jax import episode
+
+SMALL = {
+    "seeds": 1, "num_envs": 2, "rollout_length": 5, "batch_size": 8, "learning_starts": 20, "total_steps": 60,
+    "log_every": 20, "replay_capacity": 100,
+}  # fmt: skip
+RUNS = {
+    "soft": ("simple_reference", "soft", ()),
+    "discrete": ("simple_world_comm", "discrete", ("env.num_good=1", "env.num_adversaries=2")),
+}
+HEARD = {"simple_reference": {0: (1,), 1: (0,)}, "simple_world_comm": {0: (0, 1)}}
+"""Speaker -> those whose observation ends with its word."""
+
+pytestmark = pytest.mark.usefixtures("quick_jit")
+
+
+@functools.cache
+def trained(name):
+    env, actions, options = RUNS[name]
+    return matd3_jax.train(f"env.actions={actions}", "algo.hidden=[8]", *options, env=env, **SMALL)
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_what_is_played_is_what_is_heard(name):
+    """Every stored action is valid part by part, and the word in it stands in the listeners' next observation."""
+    result, env = trained(name), RUNS[name][0]
+    spec, written = result.training.spec, 10 * int(result.state.collects)
+    assert 60 <= written <= SMALL["replay_capacity"]
+    parts = spec.row_parts(np.asarray(result.state.replay)[0, :written])
+    for i, space in enumerate(spec.action_spaces):
+        action, start = spec.action_part(parts.action, i), 0
+        for size in space.sizes:
+            part = action[:, start : start + size]
+            np.testing.assert_allclose(part.sum(axis=1), 1, atol=1e-6)  # float32 softmax
+            assert (part >= 0).all() and len(np.unique(part.argmax(axis=1))) > 2
+            assert RUNS[name][1] == "soft" or set(np.unique(part)) == {0, 1}
+            start += size
+        assert start == action.shape[1]
+    for speaker, listeners in HEARD[env].items():
+        word = spec.action_part(parts.action, speaker)[:, 5:]
+        for listener in listeners:
+            np.testing.assert_array_equal(spec.observation_part(parts.next_x, listener)[:, -word.shape[1] :], word)
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_the_word_is_learnt_too(name):
+    """Updates move the actors in the columns of the movement and in those of the word, and losses are finite."""
+    result = trained(name)
+    training = result.training
+    before, _ = training.start()
+    for g, group in enumerate(training.spec.groups):
+        old, new = (
+            np.asarray(state.groups[g].actor[f"kernel_{len(group.algorithm.hidden)}"])
+            for state in (before, result.state)
+        )
+        assert (np.abs(new - old).max(axis=(0, 1, 2)) > 1e-4).all()
+    losses = [values[:, -1] for column, values in result.metrics.items() if "loss" in column]
+    assert losses and np.isfinite(losses).all()
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_deterministic_words(name):
+    """Without noise the word is the softmax of its own logits, or the likeliest one, whatever the movement's are."""
+    result, (env, actions, _) = trained(name), RUNS[name]
+    training = result.training
+    states = episode.play(training, result.state, max_steps=3).states
+    seen = jax.vmap(training.env.observe)(states)
+    for speaker in HEARD[env]:
+        g, k = training.spec.place(speaker)
+        logits, _ = reference.forward(layers(result.state.groups[g].actor, 0, k), np.asarray(seen[speaker][:-1]))
+        want = reference.softmax(logits[:, 5:])
+        if actions == "discrete":
+            want = np.eye(want.shape[1])[want.argmax(axis=1)]
+        np.testing.assert_allclose(states.comm[1:, speaker], want, atol=1e-5)  # float32
