@@ -44,12 +44,22 @@ def average(
     Raises:
         ValueError: no seeds, unknown kind, impossible confidence or number of resamples.
     """
+    values = np.moveaxis(samples(values, axis, confidence), 0, -1)
+    cut = _cut(kind, values.shape[-1])
+    return _bootstrap([values], lambda drawn: middle_mean(drawn, cut), confidence, resamples, seed)
+
+
+def location(values: np.ndarray, kind: str = "mean", axis: int = 0) -> np.ndarray:
+    """`average` without an interval."""
+    values = np.moveaxis(samples(values, axis), 0, -1)
+    return middle_mean(values, _cut(kind, values.shape[-1]))
+
+
+def _cut(kind: str, n: int) -> int:
+    """The median and the interquartile mean of n values are `middle_mean`s with this cut."""
     if kind not in AVERAGES:
         raise ValueError(f"kind={kind!r}: must be one of {', '.join(AVERAGES)}")
-    values = np.moveaxis(samples(values, axis, confidence), 0, -1)
-    n = values.shape[-1]
-    cut = {"mean": 0, "median": (n - 1) // 2, "iqm": n // 4}[kind]
-    return _bootstrap([values], lambda drawn: middle_mean(drawn, cut), confidence, resamples, seed)
+    return {"mean": 0, "median": (n - 1) // 2, "iqm": n // 4}[kind]
 
 
 def middle_mean(values: np.ndarray, cut: int) -> np.ndarray:

@@ -99,7 +99,7 @@ def welch_interval(a: np.ndarray, b: np.ndarray) -> float:
     return float(found.high - found.low) / 2
 
 
-def samples(values: np.ndarray, axis: int, confidence: float) -> np.ndarray:
+def samples(values: np.ndarray, axis: int, confidence: float = 0.95) -> np.ndarray:
     """float64 values with the seeds in front. Raises ValueError for what no interval can be had of."""
     values = np.asarray(values, dtype=float)
     if values.ndim == 0 or values.shape[axis] == 0:
