@@ -32,8 +32,8 @@ def test_hyper_parameters_and_seeds_share_a_program(override):
 
 @pytest.mark.parametrize(
     "override",
-    ["algo.policy_delay=1", "algo.num_critics=1", "batch_size=32", "algo.hidden=[9]", "env.episode_length=50", "n_step=2",
-     "total_steps=2000", "algo.target_noise=0.2", "num_envs=1", "log_every=100", "algo.adam=epsilon_hat",
+    ["algo.policy_delay=1", "algo.num_critics=1", "batch_size=32", "algo.hidden=[9]", "env.episode_length=50",
+     "n_step=2", "total_steps=2000", "algo.target_noise=0.2", "num_envs=1", "log_every=100", "algo.adam=epsilon_hat",
      "diagnostics.q_bias=true", "adversary=maddpg", "algo=maddpg"],
 )  # fmt: skip
 def test_shapes_and_schedules_do_not(override):
@@ -105,8 +105,8 @@ def test_packing_takes_no_more_pieces_than_needed():
     ],
 )
 def test_the_computed_memory_covers_the_compiled_program(quickly_compiled, monkeypatch, more):
-    """Arguments and temporaries that XLA reserves for the chunk lie below what is computed beforehand, and the replay is
-    most of both where it is large."""
+    """Arguments and temporaries that XLA reserves for the chunk lie below what is computed beforehand, and the replay
+    is most of both where it is large."""
     training = Training(load("replay_capacity=20000", "total_steps=20000", *more))
     trainer, seeds = training.trainer, len(training.seeds)
     state = jax.eval_shape(trainer.init, jax.eval_shape(training.keys))

@@ -22,7 +22,8 @@ train = importlib.import_module("matd3_jax.train")
 # Small enough to run in a second or two; both teams, an evaluation and the delay are there.
 TINY = [
     "env=simple_push", "adversary=maddpg", "algo.hidden=[8]", "adversary.hidden=[8]", "batch_size=16", "num_envs=2",
-    "learning_starts=200", "replay_capacity=500", "total_steps=600", "log_every=100", "eval_every=300", "eval_episodes=3",
+    "learning_starts=200", "replay_capacity=500", "total_steps=600", "log_every=100", "eval_every=300",
+    "eval_episodes=3",
 ]  # fmt: skip
 SWEPT = ["algo.lr=0.01,0.1", "algo.tau=0.01,0.5"]
 

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import functools
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -204,6 +205,31 @@ def take(overrides: Sequence[str], keys: Sequence[str]) -> tuple[dict[str, Any],
         else:
             rest.append(text)
     return taken, rest
+
+
+def take_text(argv: Sequence[str], keys: Sequence[str]) -> tuple[dict[str, str], list[str]]:
+    """Split off what is written after `key=` for `keys`, as it stands: for paths and words, which Hydra's grammar would
+    read as numbers, sweeps or not at all. (text by key, the other arguments)."""
+    taken, rest = {}, []
+    for argument in argv:
+        key, sign, value = argument.partition("=")
+        if sign and key in keys:
+            taken[key] = value
+        else:
+            rest.append(argument)
+    return taken, rest
+
+
+def words(text: str) -> list[str]:
+    """The words of `A,B` or `[A,B]`; quotes keep a comma in a word. Raises UserError where a quote is not closed."""
+    text = text.strip()
+    inside = text[1:-1] if text.startswith("[") and text.endswith("]") else text
+    reader = shlex.shlex(inside, posix=True)
+    reader.whitespace, reader.whitespace_split, reader.commenters = ",", True, ""
+    try:
+        return [word.strip() for word in reader if word.strip()]
+    except ValueError as error:
+        raise UserError(f"cannot read {text!r}: a quotation mark is missing") from error
 
 
 def known_names(group: str) -> tuple[str, ...]:

@@ -1,9 +1,10 @@
 """The run directory: settings, versions, the metrics table, checkpoints and pictures of one run."""
 
 import csv
+import glob
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from matd3_jax import config as configuration
 from matd3_jax.config import Config
+from matd3_jax.differences import differing, learning, text
 from matd3_jax.errors import UserError
 
 
@@ -80,13 +82,63 @@ class RunDirectory:
         partial.replace(self.metrics)
 
     def read_metrics(self) -> dict[str, np.ndarray]:
-        """The table as columns [rows]."""
-        with self.metrics.open(newline="") as file:
-            header, *rows = csv.reader(file)
+        """The table as columns [rows], without the rows of a chunk that is just being written.
+
+        Raises UserError if there is none yet.
+        """
+        written = self.metrics.read_text() if self.metrics.is_file() else ""
+        header, *rows = csv.reader(written[: written.rfind("\n") + 1].splitlines() or [""])
+        while rows and sum(row[0] == rows[-1][0] for row in rows) < sum(row[0] == rows[0][0] for row in rows):
+            rows.pop()
+        if not rows:
+            raise UserError(f"{self.path} has no metrics yet: its first row comes when learning starts")
         return {name: np.array([float(row[i]) for row in rows]) for i, name in enumerate(header)}
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         (self.path / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
+
+
+def find(words: Sequence[str]) -> list[Path]:
+    """The run directories that words name: paths, and patterns (`runs/sweep/*`) that match some.
+
+    Raises UserError for a pattern that matches none; a path is not looked at.
+    """
+    found: list[Path] = []
+    for word in words:
+        if not glob.has_magic(word) or Path(word).is_dir():
+            found.append(Path(word))
+            continue
+        matches = sorted(path for path in map(Path, glob.glob(word)) if (path / "config.yaml").is_file())
+        if not matches:
+            raise UserError(f"no run directory matches {word!r}")
+        found += matches
+    return found
+
+
+def together(paths: Sequence[Path]) -> dict[str, np.ndarray]:
+    """The metrics of runs that differ only in their seeds, as one table: columns [rows], by env step, then by seed.
+
+    Columns that only some of the runs have (evaluations, say) are left out. How long runs go and what they leave behind
+    (`differences.RECORDS`) may differ, too: then not every seed has every step.
+
+    Raises UserError where there is no run or no metrics yet, where runs differ otherwise, or two have the same seed.
+    """
+    opened = [RunDirectory.open(path) for path in paths]
+    owner: dict[int, Path] = {}
+    first = learning(opened[0][1])
+    for run, settings in opened:
+        for key in differing([first, learning(settings)])[:1]:
+            here, there = text(learning(settings).get(key)), text(first.get(key))
+            raise UserError(f"{run.path} is no run with other seeds of {paths[0]}: {key}={here}, not {there}")
+        for seed in range(settings.seed, settings.seed + settings.seeds):
+            if seed in owner:
+                raise UserError(f"{owner[seed]} and {run.path} have the same settings and both the seed {seed}")
+            owner[seed] = run.path
+    tables = [run.read_metrics() for run, _ in opened]
+    columns = [name for name in tables[0] if all(name in table for table in tables)]
+    joined = {name: np.concatenate([table[name] for table in tables]) for name in columns}
+    order = np.lexsort((joined["seed"], joined["step"]))
+    return {name: column[order] for name, column in joined.items()}
 
 
 def _text(value: Any) -> str:
