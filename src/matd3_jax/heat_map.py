@@ -38,7 +38,7 @@ def draw(path: Path, names: Sequence[str], pairings: Pairings, title: str) -> No
                 assert shown is not None
                 values[i, j] = shown.value[t]
                 words = [text(cross.value[t], cross.half[t])] if cross is not None else []
-                words += ["own " * (cross is not None) + text(own.value[t], own.half[t])] if own is not None else []
+                words += ["own " + text(own.value[t], own.half[t])] if own is not None else []
                 texts[i, j] = "\n".join(words).replace(" ± ", "\n± ")
         image = axis.imshow(np.ma.masked_invalid(values), cmap=colormaps["cividis"].with_extremes(bad="lightgrey"))
         for (i, j), label in texts.items():
