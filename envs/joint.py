@@ -84,18 +84,24 @@ class JointTeam(Environment):
 
     def reset(self, key: chex.PRNGKey) -> tuple[Any, tuple[chex.Array, ...]]:
         state, observation = self.env.reset(key)
-        return state, self._join(state, observation)
+        return state, self.join(state, observation)
 
     def step(self, key: chex.PRNGKey, state: Any, action: tuple[chex.Array, ...]) -> TimeStep:
         inner = self.env.step(key, state, self.split(action))
         rewards = tuple(inner.reward)
         mean = jnp.mean(jnp.stack([rewards[i] for i in self.members]))
         return inner._replace(
-            observation=self._join(inner.state, inner.observation), reward=jnp.stack(self._replace(rewards, mean))
+            observation=self.join(inner.state, inner.observation), reward=jnp.stack(self._replace(rewards, mean))
         )
 
     def observe(self, state: Any) -> tuple[chex.Array, ...]:
-        return self._join(state, self.env.observe(state))
+        return self.join(state, self.env.observe(state))
+
+    def join(self, state: Any, observation: tuple[chex.Array, ...]) -> tuple[chex.Array, ...]:
+        """What this one's agents see, of what the wrapped environment's see in `state`."""
+        if self._everybody:
+            return (self.env.full_observation(state),)
+        return self._replace(observation, jnp.concatenate([observation[i] for i in self.members]))
 
     def split(self, action: tuple[chex.Array, ...]) -> tuple[chex.Array, ...]:
         """The actions of the wrapped environment's agents from this one's."""
@@ -121,11 +127,6 @@ class JointTeam(Environment):
     @property
     def _everybody(self) -> bool:
         return len(self.members) == len(self.env.agents)
-
-    def _join(self, state: Any, observation: tuple[chex.Array, ...]) -> tuple[chex.Array, ...]:
-        if self._everybody:
-            return (self.env.full_observation(state),)
-        return self._replace(observation, jnp.concatenate([observation[i] for i in self.members]))
 
     def _replace(self, items: tuple, joined: Any) -> tuple:
         """`items` with `joined` for the first member and without the other members."""

@@ -1,6 +1,6 @@
 """Act in the environment: collect transitions for the replay, and evaluate policies. For one seed; `vmap` for more."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import chex
@@ -122,10 +122,23 @@ def evaluate(
     episodes: int,
     deterministic: bool,
 ) -> Evaluation:
-    """Play `episodes` whole episodes side by side; stops as soon as all have ended.
+    """Play `episodes` whole episodes side by side with one policy for all agents; stops as soon as all have ended.
 
     deterministic: no noise at all (softmax of the logits, likeliest choice, squashed output); otherwise the policies
     act as they do while collecting.
+    """
+
+    def choose(key, state, observation):
+        return decide(spec, policy, observation, None if deterministic else key)
+
+    return play(env, choose, key, episodes)
+
+
+def play(env: Environment, choose: Callable, key: chex.PRNGKey, episodes: int) -> Evaluation:
+    """Play `episodes` whole episodes side by side; stops as soon as all have ended.
+
+    choose: (key, states, observations) -> actions, as `Environment.reset` gives and `Environment.step` takes them but
+        with a leading axis [episodes].
     """
     state_key, step_key = jax.random.split(key)
     step_keys = jax.random.split(step_key, env.episode_length)
@@ -138,10 +151,7 @@ def evaluate(
     def step(carry):
         t, env_state, measured, running = carry
         act_key, env_key = jax.random.split(step_keys[t])
-        draws = None
-        if not deterministic:
-            draws = _noise(spec, act_key, (episodes,))
-        actions = env_actions(spec, act(spec, policy, env_state.observation, draws))
+        actions = choose(act_key, env_state.state, env_state.observation)
         after = jax.vmap(env.step)(jax.random.split(env_key, episodes), env_state.state, actions)
         measured += jnp.where(running[:, None], jax.vmap(env.measure)(after.state), 0)
         env_state = EnvState(
@@ -155,6 +165,15 @@ def evaluate(
     carry = (jnp.int32(0), env_state, jnp.zeros((episodes, len(env.measures))), jnp.ones(episodes, bool))
     _, env_state, measured, _ = jax.lax.while_loop(going, step, carry)
     return Evaluation(env_state.episode_return, env_state.episode_step, measured / env_state.episode_step[:, None])
+
+
+def decide(
+    spec: Spec, policy: Policy, observation: Sequence[chex.Array], key: chex.PRNGKey | None
+) -> tuple[chex.Array, ...]:
+    """What each agent does, as `Environment.step` takes it with a leading axis [envs], for one observation
+    [envs, size] per agent. key: of the noise; None: deterministic actions."""
+    draws = None if key is None else _noise(spec, key, observation[0].shape[:1])
+    return env_actions(spec, act(spec, policy, observation, draws))
 
 
 def act(
