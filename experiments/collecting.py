@@ -1,4 +1,4 @@
-"""The data of a study: what its folder holds already, what run directories have, and whether that is what was asked for.
+"""The data of a study: what its folder holds, what run directories have, and whether that is what was asked for.
 
 `runs.json` beside the tidy table has, for each setting, the resolved settings, the machine with its versions, and the
 run's summary ("not finished" without one).
@@ -68,9 +68,13 @@ def read(table: Path, facts: Path, keys: Mapping[str, str]) -> Data:
     rows = tidy.read(table)
     for label, fact in json.loads(facts.read_text()).items():
         data.facts[label] = fact
-        data.rows[label] = rows.where(**key_values(keys, fact["settings"]))
-        if not len(data.rows[label]):
+        values = key_values(keys, fact["settings"])
+        part = rows.where(**{key: value for key, value in values.items() if key in rows})
+        if not len(part):
             raise UserError(f"{facts} speaks of {label}, of which {table} has no rows: remove both")
+        # A table from before a key was among the columns has one value of it.
+        new = {key: np.full(len(part), value) for key, value in values.items() if key not in rows}
+        data.rows[label] = Table({**new, **part.columns})
     return data
 
 
@@ -97,7 +101,7 @@ def differences(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str
 def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
     whole = {**config.ADDED_LATER, **settings}
     whole["adversary"] = whole.get("adversary") or whole["algo"]
-    flat = {}
+    flat: dict[str, Any] = {}
     for key, value in whole.items():
         if isinstance(value, Mapping):
             flat |= {f"{key}.{name}": part for name, part in value.items()}

@@ -41,7 +41,9 @@ def task(env: str) -> str:
     return TASKS.get(env, env)
 
 
-def canvas(panels: int, columns: int | None = None, width: float = 4.4, height: float = 3.5) -> tuple[Figure, list[Axes]]:
+def canvas(
+    panels: int, columns: int | None = None, width: float = 4.4, height: float = 3.5
+) -> tuple[Figure, list[Axes]]:
     """A figure of panels side by side, or in rows of `columns`, without its spare frames."""
     columns = columns or panels
     rows = -(-panels // columns)

@@ -1,7 +1,8 @@
 """What the experiments share: options, training what is missing, reuse of data, and the report.
 
 A study names its settings; each becomes an ordinary run directory under `runs`, then rows of a tidy table in `out`. The
-figure and the claims are made from that table alone, so they can be made again at once, and without any run directories.
+figure and the claims are made from that table alone, so they can be made again at once, and without any run
+directories.
 """
 
 import dataclasses
@@ -65,7 +66,8 @@ class Study:
         evaluations: keep the rows with an evaluation only.
         options: options of its own, with defaults.
         check: raises UserError for options of its own that will not do.
-        place: (options) -> name of the folders under runs/experiments and experiments/results; default: NAME, NAME_small.
+        place: (options) -> name of the folders under runs/experiments and experiments/results; default: NAME,
+            NAME_small.
         data, figure: names of those files.
     """
 
@@ -144,8 +146,8 @@ def run(study: Study, argv: Sequence[str]) -> list[Claim] | None:
 
 
 def train_runs(settings: Mapping[str, Sequence[str]], folder: Path) -> dict[str, list[Path]]:
-    """Train every setting (overrides by label) into run directories of `folder`: by label, where its seeds are. Finished
-    ones are used as they are, interrupted ones go on. Raises Stopped when a signal ended the training."""
+    """Train every setting (overrides by label) into run directories of `folder`: by label, where its seeds are.
+    Finished ones are used as they are, interrupted ones go on. Raises Stopped when a signal ended the training."""
     train: Any = importlib.import_module("matd3_jax.train")
     for label, overrides in settings.items():
         path = folder / label
@@ -177,7 +179,7 @@ def report(study: Study, data: Data, out: Path, options: Mapping[str, Any]) -> l
 def departures(study: Study, data: Data, options: Mapping[str, Any]) -> list[str]:
     """Lines on where what was run departs from the paper's protocol, and what is not finished."""
     lines: dict[str, list[str]] = {}
-    paper = study.settings("paper", options)
+    paper = study.settings("paper", {**options, "env": None})  # the paper's own environment
     for label, fact in data.facts.items():
         told = []
         if label in paper:
@@ -190,9 +192,9 @@ def departures(study: Study, data: Data, options: Mapping[str, Any]) -> list[str
         if told:
             lines.setdefault(", ".join(told), []).append(label)
     found = []
-    for told, labels in lines.items():
+    for what, labels in lines.items():
         who = "" if len(labels) == len(data.facts) else f" ({', '.join(labels)})"
-        found.append(f"Departs from the paper's protocol{who}: {told}. In brackets: the protocol's.")
+        found.append(f"Departs from the paper's protocol{who}: {what}. In brackets: the protocol's.")
     found += [f"Not finished: {label}." for label in data.facts if data.unfinished(label)]
     missing = [label for label in paper if label not in data.facts]
     if missing:

@@ -1,8 +1,8 @@
-"""One tidy table for all settings of a study: from the metrics of runs, to a CSV file and back, and what is read off it.
+"""One tidy table for all settings of a study: from the metrics of runs, to CSV and back, and what is read off it.
 
-A row is a setting, a seed and a point of its training: the setting's keys (`env`, `algo`, ...), `seed`, `step` (env steps
-of this seed), `updates`, `episodes` (ended since the row before), then means over those episodes and what evaluations
-gave.
+A row is a setting, a seed and a point of its training: the setting's keys (`env`, `algo`, ...), `seed`, `step` (env
+steps of this seed), `updates`, `episodes` (ended since the row before), then means over those episodes and what
+evaluations gave.
 """
 
 import csv

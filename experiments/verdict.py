@@ -2,10 +2,10 @@
 
 The word is decided by the 95 % confidence interval of one difference, which the paper's claim says is positive, or nil:
 
-- `same`: the claim is borne out. "Greater": the whole interval lies above zero. "No difference": the whole interval lies
-  within plus or minus the margin that the claim names. "No gain": the whole interval lies below the margin.
-- `opposite`: the claim is contradicted. "Greater": the whole interval lies below zero. "No difference" and "no gain": the
-  whole interval lies outside zero (above it, for "no gain"), and it is not `same`.
+- `same`: the claim is borne out. "Greater": the whole interval lies above zero. "No difference": the whole interval
+  lies within plus or minus the margin that the claim names. "No gain": the whole interval lies below the margin.
+- `opposite`: the claim is contradicted. "Greater": the whole interval lies below zero. "No difference" and "no gain":
+  the whole interval lies outside zero (above it, for "no gain"), and it is not `same`.
 - `not shown`: neither; the data do not decide.
 - `not yet run`: a setting that the claim speaks of has no finished runs.
 
@@ -23,11 +23,11 @@ from scipy import stats
 
 DEFINITIONS = (
     "*Same*: the 95 % interval of the difference lies wholly on the side that the paper claims; for claims of no "
-    "difference wholly within ± margin, of no gain wholly below the margin. *Opposite*: it lies wholly on the other side "
-    "of zero (no difference: outside zero and not *same*; no gain: above zero and not *same*). *Not shown*: neither. "
-    "*Not yet run*: no finished runs. p-values are two-sided (means: Welch's or Student's t test; correlations: Fisher's "
-    "transformation); verdicts go by the uncorrected intervals; p (Holm) is corrected for the claims of this table that "
-    "name a direction."
+    "difference wholly within ± margin, of no gain wholly below the margin. *Opposite*: it lies wholly on the other "
+    "side of zero (no difference: outside zero and not *same*; no gain: above zero and not *same*). *Not shown*: "
+    "neither. *Not yet run*: no finished runs. p-values are two-sided (means: Welch's or Student's t test; "
+    "correlations: Fisher's transformation); verdicts go by the uncorrected intervals; p (Holm) is corrected for the "
+    "claims of this table that name a direction."
 )
 
 
@@ -48,8 +48,8 @@ class Claim:
     Attributes:
         paper: the claim in words.
         quantity: what `difference` is a difference of.
-        difference: oriented so that the paper's claim, if it has a direction, is "greater than zero"; None: not yet run.
-        kind: what the paper claims of it.
+        difference: oriented so that the paper's claim, if it has a direction, is "greater than zero"; None: not yet
+        run. kind: what the paper claims of it.
         margin: with "no difference" and "no gain": what still counts as none, in the units of the difference.
         found: our numbers in words.
     """
@@ -127,7 +127,8 @@ def negative(found: Difference) -> Difference:
 
 
 def spread(values: np.ndarray) -> np.ndarray:
-    """Distance of each value from the median: compared by `difference` this is Brown and Forsythe's test of variances."""
+    """Distance of each value from the median: compared by `difference` this is Brown and Forsythe's test of
+    variances."""
     return np.abs(values - np.median(values))
 
 
@@ -158,16 +159,20 @@ def compare(
     margin: float = 0.0,
     more: str = "",
 ) -> Claim:
-    """The claim that the mean of `first` is greater than that of `second` (or another `kind`): (name, values [seeds])."""
+    """The claim that the mean of `first` is greater than that of `second` (or another `kind`): (name, values
+    [seeds])."""
     quantity = f"{quantity}: {first[0]} less {second[0]}"
-    if first[1] is None or second[1] is None:
+    (one, a), (other, b) = first, second
+    if a is None or b is None:
         return Claim(paper, quantity, kind=kind, margin=margin)
-    found = ", ".join(f"{name} {number(values.mean())} (n = {len(values)})" for name, values in (first, second))  # type: ignore[union-attr]
-    return Claim(paper, quantity, difference(first[1], second[1]), kind, margin, found + more)
+    found = ", ".join(f"{name} {number(v.mean())} (n = {len(v)})" for name, v in ((one, a), (other, b)))
+    return Claim(paper, quantity, difference(a, b), kind, margin, found + more)
 
 
 def number(value: float) -> str:
     """Four significant digits, thousands in full."""
+    if np.isnan(value):
+        return "—"
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
@@ -175,14 +180,13 @@ def lines(claims: Sequence[Claim]) -> list[str]:
     """A Markdown table of the claims."""
     head = ("the paper", "measured", "what we found", "difference (95 % interval)", "p", "p (Holm)", "verdict")
     table = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
-    directed = [i for i, claim in enumerate(claims) if claim.difference is not None and claim.kind == "greater"]
-    corrected = dict(zip(directed, holm([claims[i].difference.p for i in directed]), strict=True))  # type: ignore[union-attr]
+    directed = {i: c.difference.p for i, c in enumerate(claims) if c.difference is not None and c.kind == "greater"}
+    corrected = dict(zip(directed, holm(list(directed.values())), strict=True))
     for i, claim in enumerate(claims):
         cells = [claim.paper, claim.quantity, claim.found or "—", "—", "—", "—", f"**{claim.verdict}**"]
         if claim.difference is not None:
             d = claim.difference
-            signed = "" if np.isnan(d.estimate) else f"{d.estimate:+,.0f}" if abs(d.estimate) >= 1000 else f"{d.estimate:+.4g}"
-            cells[3] = f"{signed} ({_interval(d)})"
+            cells[3] = f"{'+' * (d.estimate > 0)}{number(d.estimate)} ({_interval(d)})"
             if claim.kind != "greater":
                 cells[3] += f"; margin {number(claim.margin)}"
             cells[4] = _p(d.p)
