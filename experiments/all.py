@@ -73,7 +73,7 @@ def main(argv: Sequence[str]) -> int:
             lines += [] if claims is None else ["", f"[Protocol, all values, figure]({out_folder.name}/table.md)"]
         except UserError as error:
             print(f"error: {error}")
-            lines.append(f"Could not be run: {error}")
+            lines += [*verdict.lines(one.claims(Table({}))), "", f"Could not be run: {error}"]
             failed = 2
         except Stopped as stopped:
             print("stopped; go on with the same command")

@@ -52,6 +52,16 @@ class Data:
     def seeds(self, label: str) -> set[int]:
         return {int(seed) for seed in self.rows[label].values("seed")} if label in self.rows else set()
 
+    def offer(self, label: str, rows: Table, facts: dict[str, Any]) -> bool:
+        """Put rows and facts in the place of those of a setting, unless these are better: finished where the new ones
+        are not, or of the same settings with more seeds. Whether they were taken."""
+        if label in self.rows and not self.unfinished(label):
+            same = not differences(self.facts[label]["settings"], facts["settings"])
+            if facts["summary"] == UNFINISHED or same and len(rows.values("seed")) < len(self.seeds(label)):
+                return False
+        self.rows[label], self.facts[label] = rows, facts
+        return True
+
     def has(self, label: str, wanted: Config) -> bool:
         """Whether there are finished data of these settings with all these seeds."""
         if label not in self.rows or self.unfinished(label):
@@ -131,18 +141,16 @@ def find(folder: Path, label: str, wanted: Config) -> list[Path]:
     return [path for path in found if (path / "summary.json").exists()] or found
 
 
-def add(data: Data, label: str, paths: Sequence[Path], command: str, **how: Any) -> None:
-    """Put the rows of run directories, seeds of one setting, in the place of what `data` has of it.
+def gather(keys: Mapping[str, str], paths: Sequence[Path], command: str, **how: Any) -> tuple[Table, dict[str, Any]]:
+    """Rows and facts of run directories, which hold seeds of one setting (each seed of the first that has it).
 
     how: `keep`, `points` and `evaluations` of `tidy.from_metrics`.
     """
     parts, facts, seeds = [], [], set[int]()
     for path in paths:
         run, settings = RunDirectory.open(path)
-        part = tidy.from_metrics(run.read_metrics(), key_values(data.keys, settings.to_dict()), **how)
+        part = tidy.from_metrics(run.read_metrics(), key_values(keys, settings.to_dict()), **how)
         part = part.take(~np.isin(part["seed"], list(seeds)))
-        if not len(part):
-            continue
         seeds |= {int(seed) for seed in part.values("seed")}
         parts.append(part)
         summary = path / "summary.json"
@@ -154,11 +162,9 @@ def add(data: Data, label: str, paths: Sequence[Path], command: str, **how: Any)
                 "summary": json.loads(summary.read_text()) if summary.exists() else UNFINISHED,
             }
         )
-    if not parts:
-        return
-    data.rows[label] = tidy.concatenate(parts)
-    data.facts[label] = facts[0]
+    whole = facts[0]
     if len(facts) > 1:
         summaries = [fact["summary"] for fact in facts]
-        facts[0]["summary"] = UNFINISHED if UNFINISHED in summaries else {"parts": summaries}
-        facts[0]["settings"] = {**facts[0]["settings"], "seed": min(seeds), "seeds": len(seeds)}
+        whole["summary"] = UNFINISHED if UNFINISHED in summaries else {"parts": summaries}
+        whole["settings"] = {**whole["settings"], "seed": min(seeds), "seeds": len(seeds)}
+    return tidy.concatenate(parts), whole

@@ -121,7 +121,7 @@ def run(study: Study, argv: Sequence[str]) -> list[Claim] | None:
         chosen = [label for label in lines if fnmatch.fnmatch(label, options["only"] or "*")]
         if not chosen:
             raise UserError(f"only={options['only']}: matches none of {', '.join(lines)}")
-        missing = {label: lines[label] for label in chosen if not data.has(label, wanted[label])}
+        missing = {label: wanted[label] for label in chosen if not data.has(label, wanted[label])}
         for label in missing:
             if (folder / label / "config.yaml").exists():
                 collecting.check(folder / label, wanted[label])
@@ -134,8 +134,7 @@ def run(study: Study, argv: Sequence[str]) -> list[Claim] | None:
         if found:
             told = " ".join([f"python -m experiments.{study.name}", *_told(argv)])
             how = {"keep": study.keep, "points": study.points, "evaluations": study.evaluations}
-            collecting.add(data, label, found, told, **how)
-            changed = True
+            changed |= data.offer(label, *collecting.gather(study.keys, found, told, **how))
     if not data.rows:
         return None
     out.mkdir(parents=True, exist_ok=True)
@@ -145,11 +144,11 @@ def run(study: Study, argv: Sequence[str]) -> list[Claim] | None:
     return report(study, data, out, options)
 
 
-def train_runs(settings: Mapping[str, Sequence[str]], folder: Path) -> dict[str, list[Path]]:
-    """Train every setting (overrides by label) into run directories of `folder`: by label, where its seeds are.
-    Finished ones are used as they are, interrupted ones go on. Raises Stopped when a signal ended the training."""
+def train_runs(settings: Mapping[str, Config], folder: Path) -> dict[str, list[Path]]:
+    """Train every setting (by label) into run directories in `folder`: by label, where its seeds are. Finished ones are
+    used as they are, interrupted ones go on. Raises Stopped when a signal ended the training."""
     train: Any = importlib.import_module("matd3_jax.train")
-    for label, overrides in settings.items():
+    for label, config_ in settings.items():
         path = folder / label
         if (path / "summary.json").exists():
             continue
@@ -158,7 +157,7 @@ def train_runs(settings: Mapping[str, Sequence[str]], folder: Path) -> dict[str,
         elif path.exists():
             raise UserError(f"{path} has no checkpoint to go on from: remove it")
         else:
-            code = train.main([*overrides, f"out={folder}", f"name={label}"])
+            code = train.start(dataclasses.replace(config_, out=str(folder), name=label))
         if code:
             raise Stopped(code)
     return {label: [folder / label] for label in settings}
