@@ -88,16 +88,16 @@ def draw(table: Table, path: Path) -> None:
         for place, pair in enumerate(PAIRINGS):
             if pair in values:
                 figures.bar(axis, place, values[pair], figures.COLOURS[pair[0]])
-        axis.set_xticks(range(len(PAIRINGS)), [figures.NAMES[single] for _, single in PAIRINGS], fontsize=8)
+        axis.set_xticks(range(len(PAIRINGS)), [f"vs\n{figures.NAMES[single]}" for _, single in PAIRINGS], fontsize=8)
         for k, team in enumerate(ALGOS):  # below the opponents, the team: its bars have its colour
             axis.text(
-                2 * k + 0.5, -0.17, f"{figures.NAMES[team]} team", transform=axis.get_xaxis_transform(), ha="center",
+                2 * k + 0.5, -0.2, f"{figures.NAMES[team]} team", transform=axis.get_xaxis_transform(), ha="center",
                 color=figures.COLOURS[team], fontweight="bold", fontsize=9,
             )  # fmt: skip
         axis.set_xlim(-0.6, len(PAIRINGS) - 0.4)
         axis.set_title(figures.task(env), fontsize=11)
         seeds = {len(v) for v in values.values()}
-        axis.set_xlabel(f"against ({'/'.join(map(str, sorted(seeds)))} seeds)", labelpad=18)
+        axis.set_xlabel(f"{'/'.join(map(str, sorted(seeds)))} seeds", labelpad=20, fontsize=9)
     axes[0].set_ylabel("team's final return, normalised")
     figures.save(figure, path)
 

@@ -100,11 +100,11 @@ def finals_table(table: Table, keys: Sequence[str], columns: Mapping[str, str]) 
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for values in dict.fromkeys(zip(*(table[key].tolist() for key in keys), strict=True)):
         part = table.where(**dict(zip(keys, values, strict=True)))
-        cells = [f"{value:g}" if isinstance(value, float) else NAMES.get(value, value) for value in values]
+        cells = [NAMES.get(value, value) if isinstance(value, str) else f"{value:g}" for value in values]
         cells += [str(len(part.values("seed"))), f"{part.by_seed('step')[0, -1]:,.0f}"]
         finals = [tidy.final(part, name) for name in columns.values()]
         cells += [interval(final) for final in finals]
-        spreads = [f"{f.std(ddof=1):.3g}" if f is not None and len(f) > 1 else "—" for f in finals]
+        spreads = ["—" if f is None or len(f) < 2 or np.isnan(f).any() else f"{f.std(ddof=1):.3g}" for f in finals]
         lines.append(f"| {' | '.join([*cells, ', '.join(spreads)])} |")
     return lines
 
@@ -113,6 +113,8 @@ def interval(values: np.ndarray | None) -> str:
     """Mean of values [seeds] and its 95 % interval in words."""
     if values is None or np.isnan(values).all():
         return "—"
+    if np.isnan(values).any():
+        return f"{np.isnan(values).sum()} of {len(values)} seeds diverged"
     mean, half = mean_interval(values)
     return f"{number(float(mean))}" + (
         f" ({number(float(mean - half))} to {number(float(mean + half))})" if len(values) > 1 else " (one seed)"

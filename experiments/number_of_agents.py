@@ -81,8 +81,8 @@ def draw(table: Table, path: Path) -> None:
     axis.axhline(0, color="black", linewidth=0.8)
     axis.set_xlabel("agents")
     axis.set_ylabel("relative overestimation (%)")
-    axis.set_title("Cooperative Navigation")
-    axis.legend(frameon=False)
+    axis.set_title("Cooperative Navigation", pad=22)
+    axis.legend(frameon=False, ncols=2, loc="lower center", bbox_to_anchor=(0.5, 0.98))
     figures.save(figure, path)
 
 

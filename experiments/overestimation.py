@@ -127,7 +127,7 @@ def draw(table: Table, path: Path) -> None:
         steps, estimate, truth = found
         figures.band(axis, steps / 1e6, estimate, figures.COLOURS[algo], "critics' estimate")
         figures.band(axis, steps / 1e6, truth, "#555555", "true value", "--")
-        axis.legend(frameon=False, loc="lower right")
+        axis.legend(frameon=False)
         levels += list(axis.get_ylim())
         figures.band(axes[2], steps / 1e6, estimate - truth, figures.COLOURS[algo], figures.NAMES[algo])
         final = tidy.final(table.where(algo=algo), "return_agents")

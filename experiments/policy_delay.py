@@ -95,7 +95,7 @@ def draw(table: Table, path: Path) -> None:
             if len(part):
                 figures.learning(axis, part, column, colour, f"d = {d}")
         axis.set_title(figures.task(env))
-        axis.set_ylabel(f"{label}, mean of the last 1,000 episodes")
+        axis.set_ylabel(f"{label},\nmean of the last 1,000 episodes")
         axis.legend(frameon=False, loc="best")
     figures.save(figure, path)
 
