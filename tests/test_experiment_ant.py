@@ -52,7 +52,9 @@ def test_report(runs, tmp_path, capsys):
     # Last returns 40 and 120: mean 80, sd 56.57, Student's 95 % interval 80 +- 12.706 * 40.
     assert "| MATD3 | 2 | 40 | 80 ± 57 (-428 to 588) | 80 | 0.80 |" in table
     assert "| SA-TD3 | 2 | 40 | 580 ± 57 (72 to 1088) | 580 | 5.80 |" in table
-    assert "IL-TD3" not in table  # never begun
+    assert "| IL-TD3 |" not in table and "Not yet run: iltd3" in table
+    # Of two algorithms only one is finished: nothing is claimed.
+    assert table.count("**not yet run**") == 4
     facts = json.loads((out / "runs.json").read_text())
     assert facts["matd3"]["summary"] == "not finished"
     assert facts["td3"]["summary"] == {"total_steps": 40}
@@ -64,4 +66,4 @@ def test_bad_input_is_named(tmp_path):
     with pytest.raises(UserError, match="'matd4' is not one of matd3"):
         ant.main(["algos=[matd4]"])
     with pytest.raises(UserError, match="there is no run to report"):
-        ant.main(["train=false", f"runs={tmp_path}"])
+        ant.main(["train=false", f"runs={tmp_path}", f"out={tmp_path / 'out'}"])

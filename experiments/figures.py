@@ -1,0 +1,121 @@
+"""How the figures and tables of the studies look: colours that the colour-blind tell apart, bands, bars, intervals."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from experiments import tidy
+from experiments.tidy import Table
+from experiments.verdict import number
+from matd3_jax.statistics import mean_interval
+
+NAMES = {"matd3": "MATD3", "maddpg": "MADDPG", "iltd3": "IL-TD3", "td3": "SA-TD3", "iddpg": "IDDPG", "ddpg": "DDPG"}
+COLOURS = {  # Okabe and Ito's
+    "matd3": "#0072B2",
+    "maddpg": "#E69F00",
+    "iltd3": "#009E73",
+    "td3": "#CC79A7",
+    "iddpg": "#56B4E9",
+    "ddpg": "#D55E00",
+}
+SERIES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9")
+"""For what has no colour of its own."""
+
+TASKS = {
+    "simple_spread": "Cooperative Navigation",
+    "simple_speaker_listener": "Cooperative Communication",
+    "simple_crypto": "Covert Communication",
+    "simple_push": "Keep-away",
+    "simple_adversary": "Physical Deception",
+    "simple_tag": "Predator-Prey",
+}
+"""The paper's names."""
+
+
+def task(env: str) -> str:
+    """The paper's name of an environment, where it has one."""
+    return TASKS.get(env, env)
+
+
+def canvas(
+    panels: int, columns: int | None = None, width: float = 4.4, height: float = 3.5
+) -> tuple[Figure, list[Axes]]:
+    """A figure of panels side by side, or in rows of `columns`, without its spare frames."""
+    columns = columns or panels
+    rows = -(-panels // columns)
+    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes: list[Axes] = []
+    for k in range(panels):
+        axis = figure.add_subplot(rows, columns, k + 1)
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.grid(alpha=0.25)
+        axes.append(axis)
+    return figure, axes
+
+
+def band(axis: Axes, x: np.ndarray, curves: np.ndarray, colour: str, label: str, style: str = "-") -> None:
+    """Mean of curves [seeds, points] with its 95 % interval, the number of seeds in the legend."""
+    mean, half = mean_interval(curves)
+    if len(curves) > 1:
+        axis.fill_between(x, mean - half, mean + half, color=colour, alpha=0.22, linewidth=0)
+    axis.plot(x, mean, style, color=colour, label=f"{label} ({count(len(curves))})")
+
+
+def bar(axis: Axes, place: float, values: np.ndarray, colour: str, width: float = 0.8) -> None:
+    """Mean of values [seeds] with its 95 % interval, and each of them as a dot."""
+    mean, half = mean_interval(values)
+    axis.bar(place, mean, width, color=colour, alpha=0.75, zorder=2)
+    if len(values) > 1:
+        axis.errorbar(place, mean, half, color="black", capsize=3, linewidth=1.2, zorder=4)
+    across = place + np.linspace(-0.25, 0.25, len(values)) * width if len(values) > 1 else [place]
+    axis.plot(across, values, ".", color="black", markersize=3, alpha=0.45, zorder=3)
+
+
+def count(seeds: int) -> str:
+    return f"{seeds} seeds" if seeds > 1 else "one seed"
+
+
+def save(figure: Figure, path: Path) -> None:
+    figure.savefig(path, dpi=130)
+
+
+def learning(axis: Axes, table: Table, name: str, colour: str, label: str, style: str = "-") -> None:
+    """The mean return of the last episodes along training of ONE setting, a band over episodes in thousands."""
+    episodes, means = tidy.trailing(table, name)
+    band(axis, episodes / 1000, means, colour, label, style)
+    axis.set_xlabel("episodes (thousands)")
+
+
+def finals_table(table: Table, keys: Sequence[str], columns: Mapping[str, str]) -> list[str]:
+    """A Markdown table: for each setting seeds, env steps, and mean final returns with their 95 % intervals.
+
+    columns: headings, and the columns that they stand for; one that a setting lacks is left open.
+    """
+    head = (*keys, "seeds", "env steps", *(f"{heading} (95 % interval)" for heading in columns), "sd over seeds")
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    for values in dict.fromkeys(zip(*(table[key].tolist() for key in keys), strict=True)):
+        part = table.where(**dict(zip(keys, values, strict=True)))
+        cells = [NAMES.get(value, value) if isinstance(value, str) else f"{value:g}" for value in values]
+        cells += [str(len(part.values("seed"))), f"{part.by_seed('step')[0, -1]:,.0f}"]
+        finals = [tidy.final(part, name) for name in columns.values()]
+        cells += [interval(final) for final in finals]
+        spreads = ["—" if f is None or len(f) < 2 or np.isnan(f).any() else f"{f.std(ddof=1):.3g}" for f in finals]
+        lines.append(f"| {' | '.join([*cells, ', '.join(spreads)])} |")
+    return lines
+
+
+def interval(values: np.ndarray | None) -> str:
+    """Mean of values [seeds] and its 95 % interval in words."""
+    if values is None or np.isnan(values).all():
+        return "—"
+    if np.isnan(values).any():
+        return f"{np.isnan(values).sum()} of {len(values)} seeds diverged"
+    mean, half = mean_interval(values)
+    return f"{number(float(mean))}" + (
+        f" ({number(float(mean - half))} to {number(float(mean + half))})" if len(values) > 1 else " (one seed)"
+    )

@@ -1,0 +1,260 @@
+"""What the experiments share: options, training what is missing, reuse of data, and the report.
+
+A study names its settings; each becomes an ordinary run directory under `runs`, then rows of a tidy table in `out`. The
+figure and the claims are made from that table alone, so they can be made again at once, and without any run
+directories.
+"""
+
+import dataclasses
+import fnmatch
+import functools
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from experiments import collecting, verdict
+from experiments.collecting import Data
+from experiments.tidy import Table
+from experiments.verdict import Claim
+from matd3_jax import checkpoint, config, devices
+from matd3_jax.config import Config
+from matd3_jax.errors import UserError
+
+RESULTS = Path(__file__).parent / "results"
+
+OPTIONS: dict[str, Any] = {
+    "scale": "paper",
+    "seeds": None,
+    "train": True,
+    "only": None,
+    "runs": None,
+    "out": None,
+}
+
+HELP = """
+options: scale=paper|small   the paper's protocol, or one that takes minutes on a laptop
+         seeds=N             trials of each setting (default: the scale's)
+         train=true|false    false: report what there is
+         only=PATTERN        train only the settings whose names match, for instance only=*maddpg*
+         runs=DIR            run directories (default runs/experiments/NAME, or NAME_small)
+         out=DIR             data, figure and table (default experiments/results/NAME, or NAME_small)
+         key=value           any other setting of matd3_jax.train, for all settings of the study"""
+
+
+class Stopped(Exception):
+    """A signal ended the training; `code` is the exit code."""
+
+    def __init__(self, code: int):
+        self.code = code
+
+
+@dataclasses.dataclass(frozen=True)
+class Study:
+    """One experiment of the paper.
+
+    Attributes:
+        help: what the command says with --help.
+        protocol: the paper's protocol in a sentence or two, with what it leaves open.
+        settings: (scale, options) -> for each setting by label the overrides of `matd3_jax.train`.
+        keys: columns that tell the settings apart, and where each stands in the resolved settings.
+        claims: what the paper found and what we found, from the rows of finished settings.
+        draw: draws the figure from all rows into a file.
+        details: lines of Markdown under the claims, from all rows.
+        keep: patterns of the metrics to keep.
+        points: rows of each seed's curve that are kept, besides the last 1,000 episodes.
+        evaluations: keep the rows with an evaluation only.
+        options: options of its own, with defaults.
+        check: raises UserError for options of its own that will not do.
+        place: (options) -> name of the folders under runs/experiments and experiments/results; default: NAME,
+            NAME_small.
+        data, figure: names of those files.
+    """
+
+    name: str
+    title: str
+    help: str
+    protocol: str
+    settings: Callable[[str, Mapping[str, Any]], dict[str, list[str]]]
+    keys: Mapping[str, str]
+    claims: Callable[[Table], list[Claim]]
+    draw: Callable[[Table, Path], None]
+    details: Callable[[Table], list[str]]
+    keep: tuple[str, ...] = ("return_*",)
+    points: int = 120
+    evaluations: bool = False
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    check: Callable[[Mapping[str, Any]], None] = lambda options: None
+    place: Callable[[Mapping[str, Any]], tuple[Path, Path]] | None = None
+    data: str = "data.csv"
+    figure: str = "figure.png"
+
+
+def main(study: Study, argv: Sequence[str]) -> int:
+    """Run a study's command; the exit code."""
+    if {"-h", "--help"} & set(argv):
+        print(study.help.strip() + "\n" + HELP)
+        return 0
+    try:
+        claims = run(study, argv)
+    except Stopped as stopped:
+        return stopped.code
+    if claims is None:
+        raise UserError("there is no run to report")
+    return 0
+
+
+def run(study: Study, argv: Sequence[str]) -> list[Claim] | None:
+    """Train what is missing, collect, report; the claims, or None if there are no data at all.
+
+    Raises UserError for options and directories that will not do, Stopped when a signal ended the training.
+    """
+    options, overrides = parse(study, argv)
+    devices.prepare()
+    folder, out = places(study, options)
+    lines = {label: _merged(line, overrides) for label, line in _checked(study, options, overrides).items()}
+    wanted = {label: _load(tuple(line)) for label, line in lines.items()}
+    files = out / study.data, out / "runs.json"
+    data = collecting.read(*files, study.keys)
+    paths: dict[str, list[Path]] = {}
+    if options["train"]:
+        chosen = [label for label in lines if fnmatch.fnmatch(label, options["only"] or "*")]
+        if not chosen:
+            raise UserError(f"only={options['only']}: matches none of {', '.join(lines)}")
+        missing = {label: wanted[label] for label in chosen if not data.has(label, wanted[label])}
+        for label in missing:
+            if (folder / label / "config.yaml").exists():
+                collecting.check(folder / label, wanted[label])
+        paths = train_runs(missing, folder)
+    changed = False
+    for label, settings in wanted.items():
+        if data.has(label, settings):
+            continue
+        found = paths.get(label) or collecting.find(folder, label, settings)
+        if found:
+            told = " ".join([f"python -m experiments.{study.name}", *_told(argv)])
+            how = {"keep": study.keep, "points": study.points, "evaluations": study.evaluations}
+            changed |= data.offer(label, *collecting.gather(study.keys, found, told, **how))
+    if not data.rows:
+        return None
+    out.mkdir(parents=True, exist_ok=True)
+    if changed:
+        collecting.write(data, *files)
+        data = collecting.read(*files, study.keys)
+    return report(study, data, out, options)
+
+
+def train_runs(settings: Mapping[str, Config], folder: Path) -> dict[str, list[Path]]:
+    """Train every setting (by label) into run directories in `folder`: by label, where its seeds are. Finished ones are
+    used as they are, interrupted ones go on. Raises Stopped when a signal ended the training."""
+    train: Any = importlib.import_module("matd3_jax.train")
+    for label, config_ in settings.items():
+        path = folder / label
+        if (path / "summary.json").exists():
+            continue
+        if checkpoint.steps(path / "checkpoints"):
+            code = train.main([f"resume={path}"])
+        elif path.exists():
+            raise UserError(f"{path} has no checkpoint to go on from: remove it")
+        else:
+            code = train.start(dataclasses.replace(config_, out=str(folder), name=label))
+        if code:
+            raise Stopped(code)
+    return {label: [folder / label] for label in settings}
+
+
+def report(study: Study, data: Data, out: Path, options: Mapping[str, Any]) -> list[Claim]:
+    """Figure and table from the data; the claims."""
+    study.draw(data.table, out / study.figure)
+    claims = study.claims(data.finished)
+    lines = [f"# {study.title}", "", study.protocol, ""]
+    lines += [*departures(study, data, options), *verdict.lines(claims), "", verdict.DEFINITIONS, ""]
+    lines += [*study.details(data.table), "", f"![{study.title}]({study.figure})"]
+    (out / "table.md").write_text("\n".join(lines) + "\n")
+    print("\n".join(lines[:-2]))
+    return claims
+
+
+def departures(study: Study, data: Data, options: Mapping[str, Any]) -> list[str]:
+    """Lines on where what was run departs from the paper's protocol, and what is not finished."""
+    lines: dict[str, list[str]] = {}
+    paper = study.settings("paper", {**options, "env": None})  # the paper's own environment
+    for label, fact in data.facts.items():
+        told = []
+        if label in paper:
+            protocol = _load(tuple(paper[label]))
+            other = collecting.differences(fact["settings"], protocol.to_dict())
+            other = {key: pair for key, pair in other.items() if not key.startswith("adversary.")} or other
+            told += [f"{key} {was} ({asked})" for key, (was, asked) in other.items()]
+            seeds = len(data.seeds(label))
+            told += [f"seeds {seeds} ({protocol.seeds})"] if seeds != protocol.seeds else []
+        if told:
+            lines.setdefault(", ".join(told), []).append(label)
+    found = []
+    for what, labels in lines.items():
+        who = "" if len(labels) == len(data.facts) else f" ({', '.join(labels)})"
+        found.append(f"Departs from the paper's protocol{who}: {what}. In brackets: the protocol's.")
+    found += [f"Not finished: {label}." for label in data.facts if data.unfinished(label)]
+    missing = [label for label in paper if label not in data.facts]
+    if missing:
+        found.append(f"Not yet run: {', '.join(missing)}.")
+    return [line for text in found for line in (text, "")]
+
+
+# ---- options ---------------------------------------------------------------------------------------------------------
+
+
+def parse(study: Study, argv: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
+    """(options with defaults, overrides for all settings). Raises UserError."""
+    taken, overrides = config.take(argv, (*OPTIONS, *study.options))
+    options = {**OPTIONS, **study.options, **taken}
+    if options["scale"] not in ("paper", "small"):
+        raise UserError(f"scale={options['scale']}: must be paper or small")
+    if type(options["train"]) is not bool:
+        raise UserError(f"train={options['train']}: must be true or false")
+    seeds = options["seeds"]
+    if seeds is not None:
+        if type(seeds) is not int or seeds < 1:
+            raise UserError(f"seeds={seeds}: must be a whole number of at least 1")
+        overrides = [*overrides, f"seeds={seeds}"]
+    for key in ("only", "runs", "out"):
+        options[key] = None if options[key] is None else str(options[key])
+    study.check(options)
+    return options, overrides
+
+
+def places(study: Study, options: Mapping[str, Any]) -> tuple[Path, Path]:
+    """(folder of the run directories, folder of the results)."""
+    name = study.name if options["scale"] == "paper" else f"{study.name}_small"
+    folder, out = study.place(options) if study.place else (Path("runs/experiments") / name, RESULTS / name)
+    return Path(options["runs"] or folder), Path(options["out"] or out)
+
+
+def _checked(study: Study, options: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, list[str]]:
+    """The study's settings. Raises UserError for overrides that they leave no room for."""
+    lines = study.settings(options["scale"], options)
+    settings = [{text.split("=")[0]: text for text in line} for line in lines.values()]
+    varied = {key for line in settings for key in line if len({other.get(key) for other in settings}) > 1}
+    for override in config.parse(overrides):
+        key = override.key_or_group
+        if key in ("name", "resume", "checkpoint"):
+            raise UserError(f"cannot take {key}= here: the study names its runs and goes on with them by itself")
+        if key in varied:
+            raise UserError(f"cannot take {key}= here: the study itself varies it (only=PATTERN trains a part)")
+    return lines
+
+
+def _merged(line: Sequence[str], overrides: Sequence[str]) -> list[str]:
+    """A setting's overrides with the user's in the place of those for the same keys."""
+    keys = {override.key_or_group for override in config.parse(overrides)}
+    return [*(text for text in line if text.split("=")[0] not in keys), *overrides]
+
+
+@functools.cache
+def _load(overrides: tuple[str, ...]) -> Config:
+    return config.load(overrides)
+
+
+def _told(argv: Sequence[str]) -> list[str]:
+    """The arguments worth recording: not where files lay."""
+    return [text for text in argv if text.split("=")[0] not in ("runs", "out", "train")]

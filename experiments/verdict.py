@@ -1,0 +1,203 @@
+"""What the paper found beside what we found: differences with intervals and tests, and a word for each claim.
+
+The word is decided by the 95 % confidence interval of one difference, which the paper's claim says is positive, or nil:
+
+- `same`: the claim is borne out. "Greater": the whole interval lies above zero. "No difference": the whole interval
+  lies within plus or minus the margin that the claim names. "No gain": the whole interval lies below the margin.
+- `opposite`: the claim is contradicted. "Greater": the whole interval lies below zero. "No difference" and "no gain":
+  the whole interval lies outside zero (above it, for "no gain"), and it is not `same`.
+- `not shown`: neither; the data do not decide.
+- `not yet run`: a setting that the claim speaks of has no finished runs.
+
+Means are compared by Welch's t test, single means and differences within a seed by Student's, correlations by Fisher's
+transformation. p-values are two-sided. Where a table has several, Holm's correction for all of its claims of the kind
+"greater" stands beside them; the words go by the uncorrected intervals.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from scipy import stats
+
+DEFINITIONS = (
+    "*Same*: the 95 % interval of the difference lies wholly on the side that the paper claims; for claims of no "
+    "difference wholly within ± margin, of no gain wholly below the margin. *Opposite*: it lies wholly on the other "
+    "side of zero (no difference: outside zero and not *same*; no gain: above zero and not *same*). *Not shown*: "
+    "neither. *Not yet run*: no finished runs. p-values are two-sided (means: Welch's or Student's t test; "
+    "correlations: Fisher's transformation); verdicts go by the uncorrected intervals; p (Holm) is corrected for the "
+    "claims of this table that name a direction."
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """An estimate with its 95 % confidence interval and two-sided p-value; nan where there is none (one seed)."""
+
+    estimate: float
+    low: float
+    high: float
+    p: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Claim:
+    """One thing that the paper found, and what we found.
+
+    Attributes:
+        paper: the claim in words.
+        quantity: what `difference` is a difference of.
+        difference: oriented so that the paper's claim, if it has a direction, is "greater than zero"; None: not yet
+        run. kind: what the paper claims of it.
+        margin: with "no difference" and "no gain": what still counts as none, in the units of the difference.
+        found: our numbers in words.
+    """
+
+    paper: str
+    quantity: str
+    difference: Difference | None = None
+    kind: Literal["greater", "no difference", "no gain"] = "greater"
+    margin: float = 0.0
+    found: str = ""
+
+    @property
+    def verdict(self) -> str:
+        """same, opposite, not shown, or not yet run, as the module says."""
+        if self.difference is None:
+            return "not yet run"
+        low, high = self.difference.low, self.difference.high
+        if self.kind == "greater":
+            same, opposite = low > 0, high < 0
+        elif self.kind == "no difference":
+            same, opposite = -self.margin <= low and high <= self.margin, low > 0 or high < 0
+        else:
+            same, opposite = high <= self.margin, low > 0
+        return "same" if same else "opposite" if opposite else "not shown"
+
+
+# ---- tests -----------------------------------------------------------------------------------------------------------
+
+
+def difference(a: np.ndarray, b: np.ndarray) -> Difference:
+    """Mean of a [n] less mean of b [m], seeds of two settings (Welch)."""
+    estimate = float(np.mean(a) - np.mean(b))
+    if min(len(a), len(b)) < 2:
+        return Difference(estimate, np.nan, np.nan, np.nan)
+    if np.ptp(a) == np.ptp(b) == 0:
+        return _certain(estimate)
+    test = stats.ttest_ind(a, b, equal_var=False)
+    low, high = test.confidence_interval(0.95)
+    return Difference(estimate, float(low), float(high), float(test.pvalue))
+
+
+def mean(values: np.ndarray) -> Difference:
+    """Mean of values [n] against zero (Student)."""
+    estimate = float(np.mean(values))
+    if len(values) < 2:
+        return Difference(estimate, np.nan, np.nan, np.nan)
+    if np.ptp(values) == 0:
+        return _certain(estimate)
+    test = stats.ttest_1samp(values, 0)
+    low, high = test.confidence_interval(0.95)
+    return Difference(estimate, float(low), float(high), float(test.pvalue))
+
+
+def correlation(x: np.ndarray, y: np.ndarray) -> Difference:
+    """Pearson's correlation of x [n] and y [n] against zero; an interval from four points on."""
+    if len(x) < 3 or np.ptp(x) == 0 or np.ptp(y) == 0:
+        return Difference(np.nan, np.nan, np.nan, np.nan)
+    test = stats.pearsonr(x, y)
+    low, high = test.confidence_interval(0.95) if len(x) > 3 else (np.nan, np.nan)
+    return Difference(float(test.statistic), float(low), float(high), float(test.pvalue))
+
+
+def slope(x: np.ndarray, y: np.ndarray) -> Difference:
+    """Slope of the least-squares line of y [n] over x [n] against zero."""
+    if len(x) < 3 or np.ptp(x) == 0:
+        return Difference(np.nan, np.nan, np.nan, np.nan)
+    line = stats.linregress(x, y)
+    half = float(stats.t.ppf(0.975, len(x) - 2)) * line.stderr
+    return Difference(line.slope, line.slope - half, line.slope + half, float(line.pvalue))
+
+
+def negative(found: Difference) -> Difference:
+    """The same difference the other way round."""
+    return Difference(-found.estimate, -found.high, -found.low, found.p)
+
+
+def spread(values: np.ndarray) -> np.ndarray:
+    """Distance of each value from the median: compared by `difference` this is Brown and Forsythe's test of
+    variances."""
+    return np.abs(values - np.median(values))
+
+
+def holm(p: Sequence[float]) -> list[float]:
+    """p-values corrected for their number (Holm 1979); nan stays nan and does not count."""
+    found = [float("nan")] * len(p)
+    there = sorted((value, i) for i, value in enumerate(p) if not np.isnan(value))
+    largest = 0.0
+    for rank, (value, i) in enumerate(there):
+        largest = max(largest, min(1.0, (len(there) - rank) * value))
+        found[i] = largest
+    return found
+
+
+def _certain(estimate: float) -> Difference:
+    return Difference(estimate, estimate, estimate, 0.0 if estimate else 1.0)
+
+
+# ---- claims ----------------------------------------------------------------------------------------------------------
+
+
+def compare(
+    paper: str,
+    quantity: str,
+    first: tuple[str, np.ndarray | None],
+    second: tuple[str, np.ndarray | None],
+    kind: Literal["greater", "no difference", "no gain"] = "greater",
+    margin: float = 0.0,
+    more: str = "",
+) -> Claim:
+    """The claim that the mean of `first` is greater than that of `second` (or another `kind`): (name, values
+    [seeds])."""
+    quantity = f"{quantity}: {first[0]} less {second[0]}"
+    (one, a), (other, b) = first, second
+    if a is None or b is None:
+        return Claim(paper, quantity, kind=kind, margin=margin)
+    found = ", ".join(f"{name} {number(v.mean())} (n = {len(v)})" for name, v in ((one, a), (other, b)))
+    return Claim(paper, quantity, difference(a, b), kind, margin, found + more)
+
+
+def number(value: float) -> str:
+    """Four significant digits, thousands in full."""
+    if np.isnan(value):
+        return "—"
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+
+
+def lines(claims: Sequence[Claim]) -> list[str]:
+    """A Markdown table of the claims."""
+    head = ("the paper", "measured", "what we found", "difference (95 % interval)", "p", "p (Holm)", "verdict")
+    table = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    directed = {i: c.difference.p for i, c in enumerate(claims) if c.difference is not None and c.kind == "greater"}
+    corrected = dict(zip(directed, holm(list(directed.values())), strict=True))
+    for i, claim in enumerate(claims):
+        cells = [claim.paper, claim.quantity, claim.found or "—", "—", "—", "—", f"**{claim.verdict}**"]
+        if claim.difference is not None:
+            d = claim.difference
+            cells[3] = f"{'+' * (d.estimate > 0)}{number(d.estimate)} ({_interval(d)})"
+            if claim.kind != "greater":
+                cells[3] += f"; margin {number(claim.margin)}"
+            cells[4] = _p(d.p)
+            cells[5] = _p(corrected[i]) if i in corrected else "—"
+        table.append(f"| {' | '.join(cells)} |")
+    return table
+
+
+def _interval(d: Difference) -> str:
+    return "no interval" if np.isnan(d.low) else f"{number(d.low)} to {number(d.high)}"
+
+
+def _p(p: float) -> str:
+    return "—" if np.isnan(p) else "< 0.0001" if p < 0.0001 else f"{p:.2g}"

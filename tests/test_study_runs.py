@@ -1,0 +1,178 @@
+"""The experiments' commands: from run directories to reports, reuse of data, training, errors."""
+
+import csv
+import json
+import shutil
+
+import numpy as np
+import pytest
+from study_cases import NOISE, fake_run, verdicts
+
+from experiments import all as everything
+from experiments import ant, collecting, competitive, cooperative, grid_search, study, target_smoothing, tidy
+from matd3_jax import config
+from matd3_jax.errors import UserError
+from matd3_jax.runs import RunDirectory
+
+
+def test_competitive_from_run_directories(tmp_path):
+    """The team of Predator-Prey is `adversaries`, which adversary= trains; elsewhere it is `agents`."""
+    for env, algo, adversary in [
+        (env, algo, adversary)
+        for env in ("simple_tag", "simple_push", "simple_crypto")
+        for algo in ("matd3", "maddpg")
+        for adversary in ("matd3", "maddpg")
+    ]:
+        team = adversary if env == "simple_tag" else algo
+        ours = {"matd3": 10.0, "maddpg": 4.0}[team] + NOISE
+        columns = {"return_agents": (NOISE, ours), "return_adversaries": (NOISE, 0 * NOISE - 50)}
+        if env == "simple_tag":
+            columns = {"return_adversaries": (NOISE, ours), "return_agents": (NOISE, 0 * NOISE - 50)}
+        overrides = [*competitive.settings("paper", {})[f"{env}-{algo}-vs-{adversary}"][:3], "log_every=7000"]
+        if algo == adversary == "matd3":  # the same without a word
+            overrides = overrides[:2] + overrides[3:]
+        fake_run(tmp_path / "runs" / f"{env}-{algo}-vs-{adversary}", [*overrides, "eval_every=0"], columns)
+    out = tmp_path / "out"
+    argv = ["train=false", f"runs={tmp_path / 'runs'}", f"out={out}", "only=nothing"]
+    claims = {claim.paper.split(":")[0]: claim for claim in study.run(competitive.STUDY, argv)}
+    assert [claim.verdict for claim in claims.values()] == ["same", "not yet run", "same", "opposite"]
+    assert claims["Predator-Prey"].difference.estimate == pytest.approx(6)
+    table = tidy.read(out / "data.csv")
+    assert {(row.where(env="simple_tag").values("algo")[0]) for row in [table]} == {"maddpg"}
+    scaled = competitive.normalised(table, "simple_tag")
+    # Worst trial 3, best 11; the team is MATD3 in the first two pairings whatever the prey is.
+    np.testing.assert_allclose(scaled["matd3", "maddpg"], (10 + NOISE - 3) / 8)
+    np.testing.assert_allclose(scaled["maddpg", "matd3"], (4 + NOISE - 3) / 8)
+    text = (out / "table.md").read_text()
+    assert "Departs from the paper's protocol: seeds 4 (20)" in text
+    assert "Not yet run: simple_adversary-matd3-vs-matd3" in text
+    assert "| Predator-Prey | MATD3 | MADDPG | 4 | 50,000 |" in text
+    assert (out / "figure.png").stat().st_size > 10_000
+    # The same again from the data alone, and the numbers are in the table.
+    shutil.rmtree(tmp_path / "runs")
+    assert [c.difference for c in study.run(competitive.STUDY, argv)] == [c.difference for c in claims.values()]
+    facts = json.loads((out / "runs.json").read_text())
+    assert facts["simple_push-matd3-vs-maddpg"]["settings"]["adversary"]["name"] == "maddpg"
+    assert str(tmp_path) not in (out / "runs.json").read_text()
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """Nothing is trained: what would have been is remembered."""
+    asked = []
+    monkeypatch.setattr(study, "train_runs", lambda settings, folder: asked.append(dict(settings)) or {})
+    return asked
+
+
+def test_finished_data_are_used_and_only_what_is_missing_is_trained(tmp_path, trained):
+    runs, out = tmp_path / "runs", tmp_path / "out"
+    for label, line in target_smoothing.settings("small", {}).items():
+        if label != "sigma0.4":
+            fake_run(runs / label, [t for t in line if "seeds" not in t], {"return_agents": (NOISE, 10 + NOISE)})
+    argv = ["scale=small", f"runs={runs}", f"out={out}"]
+    assert target_smoothing.main([*argv, "train=false"]) == 0
+    shutil.rmtree(runs)
+    assert target_smoothing.main([*argv, "seeds=4"]) == 0
+    assert [list(settings) for settings in trained] == [["sigma0.4"]]
+    assert target_smoothing.main([*argv, "seeds=3", "only=sigma0.1"]) == 0
+    assert trained[1] == {}  # three of four seeds: enough
+    target_smoothing.main([*argv, "seeds=5", "only=sigma0.1"])
+    target_smoothing.main([*argv, "seeds=4", "only=sigma0.2", "total_steps=200000"])
+    assert [list(settings) for settings in trained[2:]] == [["sigma0.1"], ["sigma0.2"]]
+    assert trained[3]["sigma0.2"].total_steps == 200_000 and trained[3]["sigma0.2"].algo.target_noise == 0.2
+    # Nothing came of it, and nothing was lost: four seeds of three settings, two rows each.
+    with (out / "data.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == 24
+
+
+def test_unfinished_runs_are_drawn_but_claim_nothing(tmp_path):
+    runs, out = tmp_path / "runs", tmp_path / "out"
+    for label, line in cooperative.settings("paper", {}).items():
+        returns = {"return_agents": (NOISE, 10 + NOISE)}
+        fake_run(runs / label, [t for t in line if "seeds" not in t], returns, finished=label != "simple_spread-matd3")
+    claims = study.run(cooperative.STUDY, ["train=false", f"runs={runs}", f"out={out}"])
+    assert verdicts(claims) == ["not yet run"] * 3 + ["not shown"]
+    assert "Not finished: simple_spread-matd3." in (out / "table.md").read_text()
+    assert len(tidy.read(out / "data.csv").where(env="simple_spread", algo="matd3")) == 8
+
+
+def test_seeds_of_several_directories_are_one_setting(tmp_path):
+    line = [t for t in cooperative.settings("paper", {})["simple_spread-matd3"] if "seeds" not in t]
+    fake_run(tmp_path / "part0", line, {"return_agents": (NOISE, NOISE)})
+    fake_run(tmp_path / "part1", [*line, "seed=4"], {"return_agents": (NOISE, NOISE)})
+    path = tmp_path / "part1" / "metrics.csv"
+    head, *rows = path.read_text().splitlines()
+    moved = [",".join([row.split(",")[0], str(int(row.split(",")[1]) + 4), *row.split(",")[2:]]) for row in rows]
+    path.write_text("\n".join([head, *moved]) + "\n")
+    wanted = config.load([*line, "seeds=8"])
+    paths = collecting.find(tmp_path, "simple_spread-matd3", wanted)
+    how = {"keep": ("return_*",), "points": 120, "evaluations": False}
+    rows, facts = collecting.gather({"algo": "algo.name"}, paths, "command", **how)
+    data = collecting.Data({"algo": "algo.name"}, {}, {})
+    assert data.offer("a", rows, facts) and data.has("a", wanted)
+    assert facts["settings"]["seeds"] == 8 and len(facts["summary"]["parts"]) == 2
+    # Fewer seeds, or unfinished ones, do not take their place.
+    assert not data.offer("a", *collecting.gather({"algo": "algo.name"}, paths[:1], "command", **how))
+    (paths[0] / "summary.json").unlink()
+    assert not data.offer("a", *collecting.gather({"algo": "algo.name"}, paths, "command", **how))
+
+
+def test_all_makes_one_summary(tmp_path, monkeypatch):
+    monkeypatch.setattr(everything, "STUDIES", {s.STUDY.name: s.STUDY for s in (cooperative, target_smoothing, ant)})
+    for label, line in target_smoothing.settings("paper", {}).items():
+        returns = {"return_agents": (0 * NOISE, 10 + 0.1 * NOISE)}
+        fake_run(tmp_path / "runs" / "target_smoothing" / label, [t for t in line if "seeds" not in t], returns)
+    argv = ["train=false", "skip=[ant]", f"runs={tmp_path / 'runs'}", f"out={tmp_path / 'out'}"]
+    assert everything.main(argv) == 0
+    text = (tmp_path / "out" / "summary.md").read_text()
+    assert text.count("**not yet run**") == 4 and text.count("**same**") == 3
+    assert "](target_smoothing/table.md)" in text and "Robots" not in text
+    with pytest.raises(UserError, match="no experiment 'aunt'"):
+        everything.main(["skip=aunt"])
+
+
+@pytest.mark.parametrize(
+    ("argv", "line"),
+    [
+        (["scale=large"], "scale=large: must be paper or small"),
+        (["train=maybe"], "train=maybe: must be true or false"),
+        (["seeds=0"], "seeds=0: must be a whole number of at least 1"),
+        (["only=x*"], "only=x\\*: matches none of simple_spread-matd3, simple_spread-maddpg"),
+        (["algo=td3"], "cannot take algo= here: the study itself varies it"),
+        (["name=mine"], "cannot take name= here"),
+        (["learning_rate=0.1"], "there is no key 'learning_rate'"),
+        (["train=false"], "there is no run to report"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path, argv, line):
+    with pytest.raises(UserError, match=line):
+        cooperative.main([*argv, f"runs={tmp_path / 'runs'}", f"out={tmp_path / 'out'}"])
+    assert not (tmp_path / "runs").exists() and not (tmp_path / "out").exists()
+
+
+def test_runs_with_other_settings_are_refused(tmp_path):
+    line = [t for t in cooperative.settings("paper", {})["simple_spread-matd3"] if "seeds" not in t]
+    fake_run(tmp_path / "simple_spread-matd3", [*line, "algo.lr=0.003"], {"return_agents": (NOISE, NOISE)})
+    with pytest.raises(UserError, match="other settings .*algo.actor_lr 0.003 there, 0.01 here.*remove it, or choose"):
+        cooperative.main([f"runs={tmp_path}", f"out={tmp_path / 'out'}"])
+    with pytest.raises(UserError, match="task=ant scale=small"):
+        grid_search.main(["task=ant", "scale=small"])
+
+
+def test_training_from_the_command(tmp_path, quick_jit):
+    """A study trains a setting, reports it, and the next time uses it as it is."""
+    argv = ["scale=small", "only=simple_spread-maddpg", "seeds=2", "total_steps=1000", "algo.hidden=[8]",
+            "log_every=200", "batch_size=16", "learning_starts=200", "replay_capacity=1000"]  # fmt: skip
+    argv += [f"runs={tmp_path / 'runs'}", f"out={tmp_path / 'out'}"]
+    assert cooperative.main(argv) == 0
+    table = tidy.read(tmp_path / "out" / "data.csv")
+    assert table.values("seed") == [0, 1] and table.values("algo") == ["maddpg"]
+    metrics = RunDirectory(tmp_path / "runs" / "simple_spread-maddpg").read_metrics()
+    episodes = table.by_seed("episodes").sum(axis=1)
+    assert episodes.tolist() == [44, 44]  # of 25 steps; whole chunks: 1,100 env steps
+    # The last fifth: eight episodes, the last row (200 env steps) alone.
+    last = metrics["return_agents"][metrics["step"] == metrics["step"].max()]
+    np.testing.assert_allclose(tidy.final(table, "return_agents"), last, rtol=1e-4)
+    shutil.rmtree(tmp_path / "runs")
+    assert cooperative.main(argv) == 0
+    assert not (tmp_path / "runs").exists()
