@@ -55,18 +55,20 @@ def tail_note(hyper: Sequence[HyperParams], steps: int) -> str | None:
 
 
 def summary(metrics: Mapping[str, np.ndarray], agents: Sequence[str]) -> dict[str, dict[str, Final]]:
-    """For each agent its last estimate, truth and overestimation, and the mean overestimation of all evaluations after
-    the first, which is of untrained critics.
+    """For each agent its last estimate, truth and overestimation, and the mean overestimation of all evaluations of
+    trained critics (of all, if there are none).
 
     Args:
         metrics: columns [rows] of the metrics table.
     """
     found = {}
+    trained = metrics["updates"] > 0
+    if trained.any():
+        metrics = {name: column[trained] for name, column in metrics.items()}
     for agent in agents:
         values = {name: by_seed(metrics, f"{agent}_{name}")[1] for name in ("q_estimate", "q_true", "overestimation")}
         found[agent] = {name: _final(curves[:, -1]) for name, curves in values.items()}
-        over = values["overestimation"]
-        found[agent]["overestimation_mean"] = _final(over[:, min(1, over.shape[1] - 1) :].mean(axis=1))
+        found[agent]["overestimation_mean"] = _final(values["overestimation"].mean(axis=1))
     return found
 
 

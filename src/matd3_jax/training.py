@@ -223,11 +223,14 @@ class Training:
 
     def q_bias(self, state: TrainState, due: bool) -> tuple[TrainState, Row]:
         """The state with its reservoir restarted, and what an evaluation says of the critics (see
-        `overestimation.columns`); the same state and nan where none is due. No columns with diagnostics.q_bias off."""
+        `overestimation.columns`); the same state and nan where none is due, or nothing was collected since the last.
+        No columns with diagnostics.q_bias off."""
         if state.reservoir is None:
             return state, {}
-        found = self.trainer.measure_q_bias(state, self.config.diagnostics.q_bias_steps) if due else None
-        state = self.trainer.restart_reservoir(state) if due else state
+        found = None
+        if due and int(state.collects) > int(state.reservoir.since):
+            found = self.trainer.measure_q_bias(state, self.config.diagnostics.q_bias_steps)
+            state = self.trainer.restart_reservoir(state)
         return state, overestimation.columns(self.spec.agents, found, len(self.seeds))
 
 

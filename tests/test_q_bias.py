@@ -1,0 +1,413 @@
+"""Overestimation: true values and estimates against rollouts and networks by hand, the reservoir against the replay."""
+
+import csv
+import dataclasses
+import functools
+import importlib
+import json
+import re
+import shutil
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+import scipy.stats
+from learner_cases import layers
+from ledger import ENDS, HYPER, Ledger, LedgerState, by_hand
+
+from matd3_jax import checkpoint, config, learner, overestimation, q_bias
+from matd3_jax.algorithms import Algorithm
+from matd3_jax.envs import make
+from matd3_jax.envs.point import PointState
+from matd3_jax.errors import UserError
+from matd3_jax.normalisation import Statistics
+from matd3_jax.q_bias import Pairs, Values
+from matd3_jax.rollout import Policy
+from matd3_jax.schedule import Schedule
+from matd3_jax.spec import Spec
+from matd3_jax.trainer import Trainer
+
+train = importlib.import_module("matd3_jax.train")  # the name in the package is the function
+
+MATD3 = Algorithm(hidden=(5,), policy_delay=1)  # or else the loop to compile is twice as long
+IDDPG = Algorithm(name="iddpg", hidden=(6,), num_critics=1, policy_delay=1, critic="own")
+LEDGER = Spec.of(Ledger(), {"agents": MATD3, "adversaries": IDDPG})
+GAMMA = (0.9, 0.7)
+LEDGER_HYPER = tuple(HYPER._replace(gamma=gamma) for gamma in GAMMA)
+POINT = make("point_reach", num_agents=2, dim=2, episode_length=3)
+
+pytestmark = pytest.mark.usefixtures("quick_jit")
+
+
+def pairs_of_ledger(number):
+    """Running episodes of both kinds, and any actions."""
+    rng = np.random.default_rng(0)
+    name = rng.uniform(0.01, 0.99, number).astype(np.float32)
+    step = rng.integers(0, np.where(name < 0.5, ENDS, 9))
+    total = rng.normal(size=(number, 2)).astype(np.float32)
+    state = LedgerState(jnp.asarray(name), jnp.asarray(step, jnp.int32), jnp.asarray(total))
+    x = jnp.concatenate(jax.vmap(Ledger().observe)(state), axis=-1)
+    action = rng.dirichlet([1, 1], (number, 2)).reshape(number, 4)
+    return Pairs(state, jnp.concatenate([x, jnp.asarray(action, jnp.float32)], axis=-1))
+
+
+def policy_of_ledger(bias):
+    """Actors that give the logits (bias, -bias) whatever they see."""
+
+    def constant(group):
+        actor = jax.tree.map(jnp.zeros_like, group.actor)
+        return {**actor, "bias_1": actor["bias_1"] + jnp.array([bias, -bias])}
+
+    return Policy(tuple(map(constant, learner.init(LEDGER, jax.random.key(0)))), LEDGER_HYPER, None)
+
+
+def play_out(env, spec, policy, pairs, steps):
+    play = jax.jit(lambda *args: q_bias.play_out(env, spec, *args, jax.random.key(1), steps))
+    return np.asarray(play(policy, pairs))
+
+
+# ---- true values -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("steps", [1, 7])
+def test_true_values_step_by_step(steps):
+    """The stored action first, then the policies' (here always the first choice); each team's own gamma; nothing after
+    a termination; a time limit (step 5) passed by."""
+    pairs = pairs_of_ledger(60)
+    got = play_out(Ledger(), LEDGER, policy_of_ledger(60.0), pairs, steps)
+    outcomes = []
+    for k, (x, action) in enumerate(np.split(np.asarray(row, np.float64), [7]) for row in pairs.inputs):
+        want, ended, limits = np.zeros(2), False, 0
+        for t in range(steps):
+            reward, x, terminated, truncated = by_hand(x, action)
+            want, limits = want + np.array(GAMMA) ** t * reward, limits + truncated
+            ended = bool(terminated)
+            if ended:
+                break
+            action = np.array([1, 0, 1, 0])
+        outcomes.append((ended, limits > 0))
+        # float32: sums of seven rewards of up to 20.
+        np.testing.assert_allclose(got[k], want, rtol=1e-5, atol=1e-5)
+    assert steps == 1 or {(True, False), (False, True)} <= set(outcomes)
+
+
+def test_choices_are_sampled():
+    """With equal logits a choice is the softmax of Gumbel noise: of two entries uniform on (0, 1), variance 1/12. From
+    one pair many times: value r_0 + gamma (r_0 + a) after two env steps."""
+    one = jax.tree.map(lambda leaf: jnp.repeat(leaf[:1], 4000, axis=0), pairs_of_ledger(1))
+    one = one._replace(state=one.state._replace(number=jnp.full(4000, 0.9)))
+    got = np.asarray(play_out(Ledger(), LEDGER, policy_of_ledger(0.0), one, 2))
+    first = np.asarray(one.state.total)[0] + np.asarray(one.inputs)[0, [7, 9]] + [0, 10]
+    sampled = (got - first) / GAMMA - first
+    np.testing.assert_allclose(sampled.mean(axis=0), 0.5, atol=5 * np.sqrt(1 / 12 / 4000))
+    np.testing.assert_allclose(sampled.var(axis=0), 1 / 12, rtol=0.1)  # of 4,000 uniform numbers: 1.4 %
+    assert abs(np.corrcoef(sampled.T)[0, 1]) < 0.08, "agents draw noise of their own"
+
+
+def by_numpy(statistics, x):
+    return np.clip((x - statistics.mean) / np.sqrt(np.asarray(statistics.variance) + 1e-8), -10, 10)
+
+
+@functools.cache
+def on_points():
+    """(spec, policy, groups, pairs) of point_reach: own critics, normalised observations, exploration noise."""
+    rng = np.random.default_rng(3)
+    spec = Spec.of(POINT, {"agents": IDDPG})
+    groups = learner.init(spec, jax.random.key(4))
+    statistics = Statistics(*(jnp.asarray(rng.uniform(0.1, 0.5, 12), jnp.float32) for _ in range(2)))
+    hyper = HYPER._replace(gamma=0.8, exploration_noise=0.5)
+    place = [jnp.asarray(rng.uniform(-1, 1, (20, *shape)), jnp.float32) for shape in ((2, 2), (2, 2), (2,), (4,))]
+    state = PointState(*place[:3], step=jnp.asarray(rng.integers(0, 3, 20), jnp.int32))
+    x = jnp.concatenate(jax.vmap(POINT.observe)(state), axis=-1)
+    pairs = Pairs(state, jnp.concatenate([x, place[3]], axis=-1))
+    return spec, Policy(tuple(g.actor for g in groups), (hyper,), statistics), groups, pairs
+
+
+def test_true_values_of_box_actions():
+    """Damped masses in NumPy, the actors' squashed outputs without noise on normalised observations, six env steps
+    though the time limit is three."""
+    spec, policy, groups, pairs = on_points()
+    got = play_out(POINT, spec, policy, pairs, 6)
+    pos, vel, target = (np.asarray(part, np.float64) for part in pairs.state[:3])
+    force = np.asarray(pairs.inputs[:, 12:], np.float64).reshape(20, 2, 2)
+    value = 0
+    for t in range(6):
+        vel = 0.75 * vel + 0.5 * force
+        pos = pos + 0.1 * vel
+        distance = np.linalg.norm(pos - target[:, None], axis=2).mean(axis=1)
+        value = value + 0.8**t * (-distance - 0.01 * (force**2).sum(axis=2).mean(axis=1))
+        outputs = []
+        for k in range(2):
+            seen = np.concatenate([vel[:, k], target - pos[:, k], pos[:, 1 - k] - pos[:, k]], axis=1)
+            own = Statistics(*(part[6 * k : 6 * k + 6] for part in policy.statistics))
+            outputs.append(reference.forward(layers(groups[0].actor, k), by_numpy(own, seen))[0])
+        force = 2 / (1 + np.exp(-np.stack(outputs, axis=1))) - 1
+    np.testing.assert_allclose(got, np.stack([value, value], axis=1), rtol=1e-4)
+
+
+# ---- estimates -------------------------------------------------------------------------------------------------------
+
+
+def test_estimates_are_the_critics():
+    """Two central critics, their mean; one own critic, which reads its agent's parts."""
+    pairs = pairs_of_ledger(9)
+    groups = learner.init(LEDGER, jax.random.key(6))
+    got = q_bias.estimate(LEDGER, policy_of_ledger(0.0), [g.critic for g in groups], pairs.inputs)
+    rows = np.asarray(pairs.inputs, np.float64)
+    both = [reference.forward(layers(groups[0].critic, 0, j), rows)[0][:, 0] for j in range(2)]
+    assert np.abs(both[0] - both[1]).max() > 0.1
+    own = np.concatenate([rows[:, 3:7], rows[:, 9:11]], axis=1)
+    alone = reference.forward(layers(groups[1].critic, 0, 0), own)[0][:, 0]
+    np.testing.assert_allclose(got, np.stack([np.mean(both, axis=0), alone], axis=1), rtol=1e-4, atol=1e-5)
+
+
+def test_estimates_read_normalised_observations():
+    spec, policy, groups, pairs = on_points()
+    values = q_bias.measure(POINT, spec, policy, [g.critic for g in groups], pairs, jax.random.key(5), 2)
+    x, action = np.split(np.asarray(pairs.inputs, np.float64), [12], axis=1)
+    x = by_numpy(policy.statistics, x)
+    for k in range(2):
+        own = np.concatenate([x[:, 6 * k : 6 * k + 6], action[:, 2 * k : 2 * k + 2]], axis=1)
+        want = reference.forward(layers(groups[0].critic, k, 0), own)[0][:, 0]
+        np.testing.assert_allclose(values.estimate[:, k], want, rtol=1e-4, atol=1e-5)
+
+
+# ---- the reservoir ---------------------------------------------------------------------------------------------------
+
+SEEDS, SLOTS = 3, 12_000
+SCHEDULE = Schedule(num_envs=3, rollout_length=4, batch_size=8, replay_capacity=120, learning_starts=36)
+
+
+def trainer(slots):
+    hyper = {"agents": LEDGER_HYPER[0], "adversaries": LEDGER_HYPER[1]}
+    return Trainer(Ledger(), LEDGER, SCHEDULE, hyper, SEEDS, q_bias_pairs=slots)
+
+
+def plain(state):
+    data = state._replace(key=jax.random.key_data(state.key))
+    return jax.tree.map(np.asarray, data)
+
+
+@functools.cache
+def run(slots=SLOTS):
+    """(trainer, states, values measured, compilations in the end): states after two collects of prefill, two more, an
+    evaluation, two and two more."""
+    t = trainer(slots)
+    state, _ = t.prefill(t.init(jax.vmap(jax.random.key)(jnp.arange(SEEDS))))
+    states, chunk, measured = [plain(state)], t.chunk(2), None
+    state, _ = chunk(state)
+    states.append(plain(state))
+    if slots:
+        measured = jax.tree.map(np.asarray, t.measure_q_bias(state, 3))
+        state = t.restart_reservoir(state)
+    compilations = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, seconds, **_: compilations.append(event) if "backend_compile" in event else None
+    )
+    for _ in range(2):
+        state, _ = chunk(state)
+        states.append(plain(state))
+    return t, states, measured, len(compilations)
+
+
+@pytest.mark.parametrize(("state", "collects"), [(0, (0, 2)), (1, (0, 4)), (2, (4, 6)), (3, (4, 8))])
+def test_the_reservoir_is_uniform_since_the_last_evaluation(state, collects):
+    """Each pair is one transition of the replay, state and all; each transition since the last evaluation, and no
+    other, is as likely; pairs are drawn one by one, and for each seed anew."""
+    states = run()[1]
+    reservoir = states[state].reservoir
+    counts = []
+    for seed in range(SEEDS):
+        held = jax.tree.map(lambda leaf, s=seed: leaf[s], reservoir.pairs)
+        x = np.concatenate(jax.vmap(Ledger().observe)(held.state), axis=1)
+        np.testing.assert_array_equal(x, held.inputs[:, :7])
+        first, end = (c * SCHEDULE.collect_steps for c in collects)
+        rows = states[-1].replay[seed, :, :11]
+        place = {row.tobytes(): k for k, row in enumerate(rows)}
+        assert len(place) >= end
+        drawn = np.array([place[row.tobytes()] for row in held.inputs])
+        assert drawn.min() >= first and drawn.max() < end
+        counts.append(np.bincount(drawn - first, minlength=end - first))
+        # 12,000 draws: one in a million uniform reservoirs would fail.
+        assert scipy.stats.chisquare(counts[-1]).pvalue > 1e-6
+    assert (counts[0] != counts[1]).any()
+
+
+def test_measuring_by_seed():
+    """Each seed's own networks and reservoir; rewards after the first env step differ with the seed's policies."""
+    _, states, measured, _ = run()
+    assert measured.estimate.shape == measured.truth.shape == (SEEDS, SLOTS, 2)
+    for seed in range(SEEDS):
+        inputs = states[1].reservoir.pairs.inputs[seed].astype(np.float64)
+        both = [reference.forward(layers(states[1].groups[0].critic, seed, 0, j), inputs)[0][:, 0] for j in range(2)]
+        np.testing.assert_allclose(measured.estimate[seed, :, 0], np.mean(both, axis=0), rtol=1e-3, atol=1e-4)
+        # Totals grow by 0 to 1 with each action: so much lies between three env steps and their first.
+        first = inputs[:, [2, 5]] + inputs[:, [7, 9]] + [0, 10]
+        ended = (inputs[:, 0] < 0.5) & (inputs[:, 1] == ENDS - 1)
+        np.testing.assert_allclose(measured.truth[seed][ended], first[ended], rtol=1e-5, atol=1e-5)
+        on = (inputs[:, 0] > 0.5) | (inputs[:, 1] < ENDS - 2)
+        more = (measured.truth[seed] - first * (1 + np.array(GAMMA)))[on]
+        assert (more > 0).all() and ended.any() and on.any()
+
+
+def test_training_is_the_same_with_and_without():
+    """Networks, optimisers, replay, environments and keys; without, not a leaf of it. After the prefill to the bit, and
+    so later as XLA compiles the loop by default; with little optimisation it rounds some sums otherwise."""
+    on, off = (run(slots)[1] for slots in (SLOTS, 0))
+    for k, (one, other) in enumerate(zip(on, off, strict=True)):
+        assert other.reservoir is None
+        for a, b in zip(jax.tree.leaves(one._replace(reservoir=None)), jax.tree.leaves(other), strict=True):
+            if k and np.issubdtype(a.dtype, np.floating):
+                np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
+            else:
+                np.testing.assert_array_equal(a, b)
+    assert len(jax.tree.leaves(trainer(0).abstract_state())) == len(jax.tree.leaves(off[0]))
+
+
+def test_an_evaluation_costs_no_second_compilation():
+    """The state with a restarted reservoir fits the program that is there."""
+    assert run()[3] == 0
+
+
+# ---- a run -----------------------------------------------------------------------------------------------------------
+
+SETTINGS = [
+    "env=point_reach", "algo=iltd3", "seeds=2", "algo.hidden=[8]", "batch_size=16", "learning_starts=100",
+    "total_steps=900", "log_every=100", "replay_capacity=500", "checkpoint_every=200", "keep_checkpoints=9",
+    "eval_every=400", "eval_episodes=2", "normalise_observations=true",
+    "diagnostics.q_bias=true", "diagnostics.q_bias_rollouts=7", "diagnostics.q_bias_steps=5",
+]  # fmt: skip
+
+
+def table(path):
+    with (path / "metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, quick_jit):
+    out = tmp_path_factory.mktemp("runs")
+    assert train.main([*SETTINGS, f"out={out}", "name=full"]) == 0
+    return out / "full"
+
+
+def test_a_run_tells_of_it(finished, capsys):
+    """Columns at evaluations and nan between them, and before anything was collected; the figure, and the summary."""
+    rows = table(finished)
+    evaluated = np.array([row["eval_return_agents"] != "nan" for row in rows])
+    there = evaluated & (np.array([row["step"] for row in rows]) != "0")
+    assert there.sum() + 2 == evaluated.sum() < len(rows)
+    for agent in ("agent_0", "agent_1"):
+        for name in overestimation.COLUMNS:
+            values = np.array([float(row[f"{agent}_{name}"]) for row in rows])
+            np.testing.assert_array_equal(np.isfinite(values), there)
+        for row in rows:
+            over = float(row[f"{agent}_q_estimate"]) - float(row[f"{agent}_q_true"])
+            np.testing.assert_allclose(float(row[f"{agent}_overestimation"]), over, rtol=1e-5, atol=1e-6)
+            assert not float(row[f"{agent}_q_true"]) > 0  # its rewards are negative
+    assert (finished / "q_bias.png").read_bytes()[:4] == b"\x89PNG"
+    summary = json.loads((finished / "summary.json").read_text())["overestimation"]
+    last = [float(row["agent_1_overestimation"]) for row in rows[-2:]]
+    want = np.mean(last), 12.706 * np.std(last, ddof=1) / np.sqrt(2)  # Student's t of one degree of freedom
+    np.testing.assert_allclose(summary["agent_1"]["overestimation"], want, rtol=1e-4)
+    every = [[float(r["agent_1_overestimation"]) for r in rows if r["seed"] == s] for s in "01"]
+    np.testing.assert_allclose(summary["agent_1"]["overestimation_mean"][0], np.nanmean(every), rtol=1e-6)
+
+
+def test_stopped_between_evaluations_and_resumed(finished, tmp_path):
+    """From a checkpoint half way to an evaluation, whose reservoir already holds what came before: the same table."""
+    copy = Path(shutil.copytree(finished, tmp_path / "copy"))
+    rows = table(copy)
+    evaluated = {int(row["step"]) for row in rows if row["eval_return_agents"] != "nan"}
+    first, *later = checkpoint.steps(copy / "checkpoints")
+    assert first not in evaluated and later
+    for step in later:
+        shutil.rmtree(copy / "checkpoints" / str(step))
+    assert train.main([f"resume={copy}"]) == 0
+    assert (copy / "metrics.csv").read_bytes() == (finished / "metrics.csv").read_bytes()
+
+
+# ---- numbers and words of it -----------------------------------------------------------------------------------------
+
+
+def test_columns():
+    """Means over the pairs and Student's intervals, for each seed and agent."""
+    rng = np.random.default_rng(7)
+    estimate, truth = rng.normal(size=(2, 3, 10, 2))
+    got = overestimation.columns(("a", "b"), Values(estimate, truth), 3)
+    assert set(got) == {f"{agent}_{name}" for agent in "ab" for name in overestimation.COLUMNS}
+    for i, agent in enumerate("ab"):
+        np.testing.assert_allclose(got[f"{agent}_q_estimate"], estimate[:, :, i].mean(axis=1))
+        for name, values in (("q_true", truth), ("overestimation", estimate - truth)):
+            low, high = scipy.stats.ttest_1samp(values[:, :, i], 0, axis=1).confidence_interval(0.95)
+            np.testing.assert_allclose(got[f"{agent}_{name}"], (low + high) / 2)
+            np.testing.assert_allclose(got[f"{agent}_{name}_interval"], (high - low) / 2)
+    none = overestimation.columns(("a", "b"), None, 3)
+    assert list(none) == list(got) and np.isnan(list(none.values())).all()
+
+
+@pytest.mark.parametrize(("gamma", "steps", "words"), [
+    (0.95, 100, None),
+    (np.array([0.95, 0.99]), 100, "leaves out 37 % .*; diagnostics.q_bias_steps=390 leaves out 2 %"),
+    (0.99, 390, None),
+    (1.0, 1000, r"leaves out 100 % .*positive$"),
+])  # fmt: skip
+def test_too_short_rollouts_are_told_of(gamma, steps, words):
+    note = overestimation.tail_note([HYPER._replace(gamma=0.5), HYPER._replace(gamma=gamma)], steps)
+    assert (note is None) if words is None else re.search(words, note)
+
+
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_lines_and_figure_of_any_number_of_seeds(seeds, tmp_path):
+    """One seed: the interval is that of its pairs."""
+    metrics = {
+        "updates": np.repeat([0.0, 1.0, 2.0], seeds),
+        "step": np.repeat([10.0, 20.0, 30.0], seeds),
+        "seed": np.tile(np.arange(seeds), 3),
+    }
+    for agent, shift in (("a", 0), ("b", 5), ("c", 7)):
+        numbers = np.tile([1.0, np.nan, 3.0], (seeds, 1)).T.ravel() + shift
+        metrics |= {f"{agent}_{name}": numbers + k for k, name in enumerate(overestimation.COLUMNS)}
+    assert overestimation.summary(metrics, "c")["c"]["overestimation_mean"][0] == 13  # not the untrained critics' 11
+    head, *lines = overestimation.lines(metrics, "abc", 200)
+    assert ("200 rollouts)" if seeds == 1 else "2 seeds)") in head
+    assert lines[0] == f"  a: estimate 3, truth 4, overestimation 6 ± {'7' if seeds == 1 else '0'}"
+    path = tmp_path / "q_bias.png"
+    overestimation.draw(path, metrics, {"agents": ["a", "b"], "adversaries": ["c"]}, "title")
+    assert path.read_bytes()[:4] == b"\x89PNG"
+    steps, values = overestimation.team_values(metrics, ["a", "b"], "q_true")
+    np.testing.assert_array_equal(steps, [10, 30])
+    np.testing.assert_array_equal(values, [[4.5, 6.5]] * seeds)
+
+
+# ---- settings --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("overrides", "words"), [
+    (["diagnostics.q_bias_rollouts=0"], "diagnostics.q_bias_rollouts=0: must be at least 1"),
+    (["diagnostics.q_bias_steps=0"], "diagnostics.q_bias_steps=0: must be at least 1"),
+    (["diagnostics.q_bias=2"], "diagnostics.q_bias=2: must be true or false"),
+    (["diagnostics=true"], "diagnostics=True: must be a group of keys"),
+    (["diagnostics.q_bais=true"], "did you mean 'q_bias"),
+    (["q_bias=true"], "did you mean 'diagnostics.q_bias'"),
+    (["diagnostics.q_bias=true", "eval_every=0"], "eval_every=0 means none"),
+])  # fmt: skip
+def test_mistakes(overrides, words):
+    with pytest.raises(UserError) as error:
+        config.load(overrides)
+    assert words in str(error.value) and "\n" not in str(error.value)
+
+
+def test_runs_from_before(tmp_path):
+    """Without the group, or with a part of it, a run's settings mean what they meant: off."""
+    old = config.load()
+    assert old.diagnostics == config.DiagnosticsConfig(q_bias=False, q_bias_rollouts=200, q_bias_steps=100)
+    on = dataclasses.replace(old, diagnostics=dataclasses.replace(old.diagnostics, q_bias=True))
+    for settings, kept in ((old, None), (old, {}), (on, {"q_bias": True})):
+        values = {key: value for key, value in settings.to_dict().items() if key != "diagnostics"}
+        values |= {} if kept is None else {"diagnostics": kept}
+        (tmp_path / "config.yaml").write_text(json.dumps(values))  # JSON is YAML
+        assert config.read(tmp_path / "config.yaml") == settings
