@@ -8,7 +8,6 @@ directories.
 import dataclasses
 import fnmatch
 import functools
-import importlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,9 +16,10 @@ from experiments import collecting, verdict
 from experiments.collecting import Data
 from experiments.tidy import Table
 from experiments.verdict import Claim
-from matd3_jax import checkpoint, config, devices
+from matd3_jax import config, devices, sweeping
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError
+from matd3_jax.sweeping import Stopped
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -40,13 +40,6 @@ options: scale=paper|small   the paper's protocol, or one that takes minutes on 
          runs=DIR            run directories (default runs/experiments/NAME, or NAME_small)
          out=DIR             data, figure and table (default experiments/results/NAME, or NAME_small)
          key=value           any other setting of matd3_jax.train, for all settings of the study"""
-
-
-class Stopped(Exception):
-    """A signal ended the training; `code` is the exit code."""
-
-    def __init__(self, code: int):
-        self.code = code
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,9 +116,9 @@ def run(study: Study, argv: Sequence[str]) -> list[Claim] | None:
             raise UserError(f"only={options['only']}: matches none of {', '.join(lines)}")
         missing = {label: wanted[label] for label in chosen if not data.has(label, wanted[label])}
         for label in missing:
-            if (folder / label / "config.yaml").exists():
-                collecting.check(folder / label, wanted[label])
-        paths = train_runs(missing, folder)
+            if (folder / "runs" / label / "config.yaml").exists():
+                collecting.check(folder / "runs" / label, wanted[label])
+        paths = sweeping.train(missing, folder)
     changed = False
     for label, settings in wanted.items():
         if data.has(label, settings):
@@ -142,25 +135,6 @@ def run(study: Study, argv: Sequence[str]) -> list[Claim] | None:
         collecting.write(data, *files)
         data = collecting.read(*files, study.keys)
     return report(study, data, out, options)
-
-
-def train_runs(settings: Mapping[str, Config], folder: Path) -> dict[str, list[Path]]:
-    """Train every setting (by label) into run directories in `folder`: by label, where its seeds are. Finished ones are
-    used as they are, interrupted ones go on. Raises Stopped when a signal ended the training."""
-    train: Any = importlib.import_module("matd3_jax.train")
-    for label, config_ in settings.items():
-        path = folder / label
-        if (path / "summary.json").exists():
-            continue
-        if checkpoint.steps(path / "checkpoints"):
-            code = train.main([f"resume={path}"])
-        elif path.exists():
-            raise UserError(f"{path} has no checkpoint to go on from: remove it")
-        else:
-            code = train.start(dataclasses.replace(config_, out=str(folder), name=label))
-        if code:
-            raise Stopped(code)
-    return {label: [folder / label] for label in settings}
 
 
 def report(study: Study, data: Data, out: Path, options: Mapping[str, Any]) -> list[Claim]:

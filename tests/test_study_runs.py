@@ -10,7 +10,7 @@ from study_cases import NOISE, fake_run, verdicts
 
 from experiments import all as everything
 from experiments import ant, collecting, competitive, cooperative, grid_search, study, target_smoothing, tidy
-from matd3_jax import config
+from matd3_jax import config, sweeping
 from matd3_jax.errors import UserError
 from matd3_jax.runs import RunDirectory
 
@@ -60,7 +60,7 @@ def test_competitive_from_run_directories(tmp_path):
 def trained(monkeypatch):
     """Nothing is trained: what would have been is remembered."""
     asked = []
-    monkeypatch.setattr(study, "train_runs", lambda settings, folder: asked.append(dict(settings)) or {})
+    monkeypatch.setattr(sweeping, "train", lambda settings, folder: asked.append(dict(settings)) or {})
     return asked
 
 

@@ -181,20 +181,27 @@ class Piece:
               f"{needed(training.trainer, seeds) / 1e9:.2f} GB in all", flush=True)  # fmt: skip
 
 
-def train(settings: Mapping[str, Config], folder: Path, budget: int | None = None) -> dict[str, list[Path]] | None:
-    """Train what is missing of `settings` (by name) in `folder`: the directories of each setting's finished runs, or
-    None where a signal stopped it; the same call goes on. `budget`: as for `Sweep.add`.
+class Stopped(Exception):
+    """A signal ended the training; `code` is the exit code."""
 
-    Raises UserError.
+    def __init__(self, code: int):
+        self.code = code
+
+
+def train(settings: Mapping[str, Config], folder: Path, budget: int | None = None) -> dict[str, list[Path]]:
+    """Train what is missing of `settings` (by name) in `folder`: the directories of each setting's finished runs.
+
+    The same call goes on where it was stopped, and finished runs are used as they are. `budget`: as for `Sweep.add`.
+    Raises UserError, and Stopped when a signal ended the training.
     """
     sweep = Sweep(folder)
     runs = sweep.add(settings, budget)
     wanted = [path for paths in runs.values() for path in paths]
     names = {path.name for path in wanted}
     code = sweep.train([k for k, piece in enumerate(sweep.pieces) if names & set(piece)])
-    unfinished = [path for path in wanted if not (path / "summary.json").exists()]
-    if unfinished and not code:
-        raise UserError(
-            f"{unfinished[0]} is not finished: another process is at it, or it is not part of {folder}'s plan"
-        )
-    return None if code else runs
+    if code:
+        raise Stopped(code)
+    for path in wanted:
+        if not (path / "summary.json").exists():
+            raise UserError(f"{path} is not finished, and not here to be: another process is at it, or none knows it")
+    return runs
