@@ -66,15 +66,18 @@ def claims(table: Table) -> list[Claim]:
         more = (
             f"; {(final['iltd3'] > STANDING).sum()} of {len(final['iltd3'])} IL-TD3 seeds do better than standing still"
         )
-    last = "last evaluation"
+    env = "/".join(table.values("env")) or "ant"
+    last = f"{env}: last evaluation"
     ours = {algo: (figures.NAMES[algo], values) for algo, values in final.items()}
     return [
-        verdict.compare("MATD3 performs better than MADDPG", last, ours["matd3"], ours["maddpg"]),
-        verdict.compare("IL-TD3 fails in all trials", last, ours["matd3"], ours["iltd3"], more=more),
-        verdict.compare("SA-TD3 outperforms all multi-agent approaches in the end", last, ours["td3"], ours["matd3"]),
+        verdict.compare("Ant: MATD3 performs better than MADDPG", last, ours["matd3"], ours["maddpg"]),
+        verdict.compare("Ant: IL-TD3 fails in all trials", last, ours["matd3"], ours["iltd3"], more=more),
         verdict.compare(
-            "SA-TD3 does so only after many time steps",
-            "mean over the evaluations of the first half",
+            "Ant: SA-TD3 outperforms all multi-agent approaches in the end", last, ours["td3"], ours["matd3"]
+        ),
+        verdict.compare(
+            "Ant: SA-TD3 does so only after many time steps",
+            f"{env}: mean over the evaluations of the first half",
             ("MATD3", early["matd3"]),
             ("SA-TD3", early["td3"]),
         ),
