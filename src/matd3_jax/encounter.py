@@ -24,7 +24,7 @@ from matd3_jax.training import Training
 
 TEAMS = ("agents", "adversaries")
 """The two sides, in the order of every axis [teams]."""
-SIDE_BY_SIDE = {"cpu": 2**12, "gpu": 2**16, "tpu": 2**16}
+SIDE_BY_SIDE = {"cpu": 2**12, "other": 2**16}
 """Environments that a device steps at a time, unless one pair alone plays more episodes: bounds the memory."""
 
 
@@ -126,7 +126,8 @@ def play(
     key = jax.random.fold_in(jax.random.key(seed), 2**31 - 1)
     devices = jax.devices()[: len(pairs)]
     share = -(-len(pairs) // len(devices))
-    piece = min(share, max(1, SIDE_BY_SIDE[devices[0].platform] // episodes)) * len(devices)
+    width = SIDE_BY_SIDE["cpu" if devices[0].platform == "cpu" else "other"]
+    piece = min(share, max(1, width // episodes)) * len(devices)
     program = _program(env, tuple(team.side for team in teams), tuple(devices), episodes, deterministic)
     policies = jax.device_put(tuple(team.policy for team in teams))
     found = []
