@@ -152,7 +152,7 @@ def test_bad_input_is_one_line(tmp_path, argv, line):
 
 def test_runs_with_other_settings_are_refused(tmp_path):
     line = [t for t in cooperative.settings("paper", {})["simple_spread-matd3"] if "seeds" not in t]
-    fake_run(tmp_path / "simple_spread-matd3", [*line, "algo.lr=0.003"], {"return_agents": (NOISE, NOISE)})
+    fake_run(tmp_path / "runs" / "simple_spread-matd3", [*line, "algo.lr=0.003"], {"return_agents": (NOISE, NOISE)})
     with pytest.raises(UserError, match="other settings .*algo.actor_lr 0.003 there, 0.01 here.*remove it, or choose"):
         cooperative.main([f"runs={tmp_path}", f"out={tmp_path / 'out'}"])
     with pytest.raises(UserError, match="task=ant scale=small"):
@@ -167,7 +167,7 @@ def test_training_from_the_command(tmp_path, quick_jit):
     assert cooperative.main(argv) == 0
     table = tidy.read(tmp_path / "out" / "data.csv")
     assert table.values("seed") == [0, 1] and table.values("algo") == ["maddpg"]
-    metrics = RunDirectory(tmp_path / "runs" / "simple_spread-maddpg").read_metrics()
+    metrics = RunDirectory(tmp_path / "runs" / "runs" / "simple_spread-maddpg").read_metrics()
     episodes = table.by_seed("episodes").sum(axis=1)
     assert episodes.tolist() == [44, 44]  # of 25 steps; whole chunks: 1,100 env steps
     # The last fifth: eight episodes, the last row (200 env steps) alone.
