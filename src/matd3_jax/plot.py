@@ -55,7 +55,7 @@ def main(argv: Sequence[str]) -> int:
         return 0
     options = _options(argv)
     groups = _groups(runs.find(options["runs"]))
-    settings = [found[0] for found in groups.values()]
+    settings = list(groups.values())
     found_labels = differences.label_differences(settings)
     labels = options["labels"] or found_labels
     if len(labels) != len(groups):
@@ -81,20 +81,18 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def _groups(paths: Sequence[Path]) -> dict[tuple[Path, ...], list[config.Config]]:
-    """Runs that differ only in their seeds belong together: (paths of a curve: their settings)."""
-    opened = [(path, runs.RunDirectory.open(path)[1]) for path in paths]
-    found: list[tuple[dict[str, Any], list[Path], list[config.Config]]] = []
-    for path, settings in opened:
+def _groups(paths: Sequence[Path]) -> dict[tuple[Path, ...], config.Config]:
+    """Runs that differ only in their seeds belong together: (paths of a curve: settings of its first run)."""
+    found: list[tuple[dict[str, Any], list[Path], config.Config]] = []
+    for path in paths:
+        settings = runs.RunDirectory.open(path)[1]
         own = differences.learning(settings)
-        for other, members, configs in found:
-            if other == own:
-                members.append(path)
-                configs.append(settings)
-                break
+        members = next((members for other, members, _ in found if other == own), None)
+        if members is None:
+            found.append((own, [path], settings))
         else:
-            found.append((own, [path], [settings]))
-    return {tuple(members): configs for _, members, configs in found}
+            members.append(path)
+    return {tuple(members): settings for _, members, settings in found}
 
 
 def _curves(
