@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matd3_jax import config, curves, plot, plotting
 from matd3_jax.differences import label_differences
 from matd3_jax.errors import UserError
-from matd3_jax.runs import RunDirectory, find, together
+from matd3_jax.runs import RunDirectory, together
 
 
 @functools.cache
@@ -179,7 +179,7 @@ def some_runs(tmp_path_factory):
         ([], "say which runs to draw: runs="),
         (["runs=nowhere"], "there is no run directory nowhere"),
         (["runs=."], "no config.yaml"),
-        (["runs=x*"], r"no run directory matches 'x\*'"),
+        (["runs=x*"], r"runs=x\*: no run directory matches"),
         (["runs=new"], "new has no metrics yet"),
         (["runs=a,a"], "a and a have the same settings and both the seed 0"),
         (["runs=a", "y=return_agent"], "y=return_agent: a has no such column; did you mean 'return_agents'"),
@@ -308,14 +308,6 @@ def test_a_table_that_is_being_written(tmp_path):
         table = run.read_metrics()
         assert table["step"].tolist() == [100] * 3 + [200] * 3 + [300] * 3
         np.testing.assert_array_equal(table["return_agents"].reshape(3, 3).astype(np.float32), want[:, :3].T)
-
-
-def test_find(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for name in ("runs/b", "runs/a", "c[1]"):
-        make_run(tmp_path / name, "seeds=1", steps=(100,))
-    (tmp_path / "runs" / "notes").mkdir()
-    assert [str(path) for path in find(["c[1]", "runs/*", "elsewhere"])] == ["c[1]", "runs/a", "runs/b", "elsewhere"]
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from matd3_jax import overestimation
+
 AXES = ("step", "episodes", "updates")
 """What a curve can be drawn over; episodes: the number ended so far."""
 
@@ -70,7 +72,8 @@ def of_table(metrics: Mapping[str, np.ndarray], name: str, over: str = "step", w
 
 def evaluated(name: str) -> bool:
     """Whether a column comes from evaluations, which are made at one moment, and not from what lies between rows."""
-    return name.startswith("eval_") or "_eval_" in name
+    judged = tuple(f"_{column}" for column in overestimation.COLUMNS)
+    return name.startswith("eval_") or "_eval_" in name or name.endswith(judged)
 
 
 def running_mean(y: np.ndarray, episodes: np.ndarray, window: float) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 from matd3_jax import bootstrap, command, config, curves, differences, plotting, runs, statistics
 from matd3_jax.envs.base import nearest
 from matd3_jax.errors import UserError
+from matd3_jax.paths import paths
 from matd3_jax.plotting import Line, Panel
 
 HELP = """usage: python -m matd3_jax.plot runs=RUN_DIR,RUN_DIR,... [key=value ...]
@@ -40,7 +41,7 @@ DEFAULTS: dict[str, Any] = {
     "title": None,
     "each": False,
 }
-WRITTEN = ("runs", "y", "out", "labels", "title")
+WRITTEN = ("y", "out", "labels", "title")
 """Taken as they stand on the command line."""
 INTERVALS = {"mean": ("t", "bootstrap", "sd", "none"), "median": ("bootstrap", "none"), "iqm": ("bootstrap", "none")}
 X_LABELS = {"step": "env steps of each seed", "episodes": "episodes of each seed", "updates": "updates"}
@@ -54,7 +55,7 @@ def main(argv: Sequence[str]) -> int:
         print(HELP)
         return 0
     options = _options(argv)
-    groups = _groups(runs.find(options["runs"]))
+    groups = _groups(options["runs"])
     settings = list(groups.values())
     found_labels = differences.label_differences(settings)
     labels = options["labels"] or found_labels
@@ -172,13 +173,14 @@ def _caption(table: Mapping[str, np.ndarray], many: bool, options: Mapping[str, 
 
 
 def _options(argv: Sequence[str]) -> dict[str, Any]:
-    written, rest = config.take_text(argv, WRITTEN)
+    where, rest = paths(argv)
+    written, rest = config.take_text(rest, WRITTEN)
     taken, rest = config.take(rest, tuple(DEFAULTS))
     if rest:
         key = rest[0].split("=")[0]
         raise UserError(f"there is no key {key!r}; {nearest(key, DEFAULTS)}")
-    options = {**DEFAULTS, **taken, **written}
-    for key in ("runs", "y", "labels"):
+    options = {**DEFAULTS, **taken, **written, "runs": where}
+    for key in ("y", "labels"):
         options[key] = options[key] if options[key] is None else config.words(options[key])
     if not options["runs"]:
         raise UserError("say which runs to draw: runs=RUN_DIR,RUN_DIR,...")

@@ -1,7 +1,6 @@
 """The run directory: settings, versions, the metrics table, checkpoints and pictures of one run."""
 
 import csv
-import glob
 import json
 import shutil
 from collections.abc import Mapping, Sequence
@@ -96,23 +95,6 @@ class RunDirectory:
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         (self.path / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
-
-
-def find(words: Sequence[str]) -> list[Path]:
-    """The run directories that words name: paths, and patterns (`runs/sweep/*`) that match some.
-
-    Raises UserError for a pattern that matches none; a path is not looked at.
-    """
-    found: list[Path] = []
-    for word in words:
-        if not glob.has_magic(word) or Path(word).is_dir():
-            found.append(Path(word))
-            continue
-        matches = sorted(path for path in map(Path, glob.glob(word)) if (path / "config.yaml").is_file())
-        if not matches:
-            raise UserError(f"no run directory matches {word!r}")
-        found += matches
-    return found
 
 
 def together(paths: Sequence[Path]) -> dict[str, np.ndarray]:
