@@ -1,0 +1,95 @@
+"""`python -m benchmarks.sweep`: what a sweep costs beside as many seeds of one setting.
+
+    python -m benchmarks.sweep [seeds=4] [repeats=5] [steps=1200] [out=FILE.json] [swept key=VALUES ...] [key=value ...]
+
+Takes settings as `python -m matd3_jax.sweep` does (default: the 18 of its documentation) and times, in turns, a stretch
+of `steps` env steps of every seed of each program that the sweep consists of, and of one program with as many seeds of
+the setting without the swept values. The cost is the time of all the sweep's programs over that of the one; compilation
+is told apart. Where a swept value changes what is computed (policy_delay=1 updates actors twice as often as the
+default), that is in the cost.
+"""
+
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from benchmarks.throughput import commit
+from matd3_jax import command, config, devices, plan, sweep
+from matd3_jax.config import Config
+from matd3_jax.search_space import SearchSpace
+from matd3_jax.training import Training
+
+DEFAULTS: dict[str, Any] = {"seeds": 4, "repeats": 5, "steps": 1200, "out": None}
+SWEPT = ("algo.lr=0.01,0.003,0.001", "algo.tau=0.01,0.005", "algo.policy_delay=1,2,3")
+SHORT = ("learning_starts=2000", "replay_capacity=10000", "total_steps=10000")
+"""A small replay, so that the sweep fits into one piece for each program; rows are drawn at random all the same."""
+
+
+def main(argv: Sequence[str]) -> int:
+    devices.prepare()
+    keys = [override.key_or_group for override in config.parse(argv, sweep=True)]
+    mine = [text for text, key in zip(argv, keys, strict=True) if key in DEFAULTS]
+    options = {**DEFAULTS, **config.take(mine, tuple(DEFAULTS))[0]}
+    overrides = [*SHORT, *(text for text in argv if text not in mine), f"seeds={options['seeds']}"]
+    if not SearchSpace.parse(overrides).axes:
+        overrides += SWEPT
+    _, settings = sweep.read(overrides, None, 0)
+    groups: dict[str, list[Config]] = {}
+    for setting in settings.values():
+        groups.setdefault(plan.program(setting), []).append(setting)
+    base = config.load(SearchSpace.parse(overrides).fixed)
+    alone = [config.load([*SearchSpace.parse(overrides).fixed, f"seeds={len(settings) * base.seeds}"])]
+    programs = [_Program(members, options["steps"]) for members in [alone, *groups.values()]]
+    seconds = np.array([[program.stretch() for program in programs] for _ in range(options["repeats"])])
+    cost = seconds[:, 1:].sum(axis=1) / seconds[:, 0]
+    rates = len(settings) * base.seeds * programs[0].steps / seconds[:, 0]
+    compiled = [program.compile_seconds for program in programs]
+    report = {
+        "machine": devices.description(),
+        "versions": devices.versions(),
+        "commit": commit(),
+        "settings": list(argv),
+        "sweep": f"{len(settings)} settings x {base.seeds} seeds in {len(groups)} programs",
+        "cost": {"median": float(np.median(cost)), "lowest": float(cost.min()), "highest": float(cost.max())},
+        "env_steps_per_second_of_one_setting": float(np.median(rates)),
+        "compile_seconds": {"one setting": compiled[0], "programs of the sweep": compiled[1:]},
+    }
+    print(f"{report['sweep']} against {len(settings) * base.seeds} seeds of one setting: cost "
+          f"{np.median(cost):.3f} ({cost.min():.3f} to {cost.max():.3f}); {np.median(rates):,.0f} env steps/s; "
+          f"compiled in {compiled[0]:.0f} s against {' + '.join(f'{s:.0f}' for s in compiled[1:])} s")  # fmt: skip
+    if options["out"] is not None:
+        Path(str(options["out"])).write_text(json.dumps(report, indent=1) + "\n")
+    return 0
+
+
+class _Program:
+    """The chunk of runs that share a program, compiled and warm."""
+
+    def __init__(self, members: list[Config], steps: int):
+        training = Training(members[0], members=members)
+        trainer = training.trainer
+        self.state, _ = trainer.prefill(trainer.init(training.keys()))
+        cycles = max(1, round(steps / trainer.cycle_steps))
+        self.steps = cycles * trainer.cycle_steps
+        self.scale = steps / self.steps
+        begun = time.monotonic()
+        self.chunk = trainer.chunk(cycles)
+        self.state, _ = jax.block_until_ready(self.chunk(self.state))
+        self.compile_seconds = round(time.monotonic() - begun, 1)
+
+    def stretch(self) -> float:
+        """Seconds for `steps` env steps of every seed."""
+        begun = time.monotonic()
+        self.state, _ = jax.block_until_ready(self.chunk(self.state))
+        return (time.monotonic() - begun) * self.scale
+
+
+if __name__ == "__main__":
+    sys.argv[0] = "sweep"
+    command.run(main)
