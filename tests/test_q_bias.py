@@ -54,6 +54,11 @@ def pairs_of_ledger(number):
     return Pairs(state, jnp.concatenate([x, jnp.asarray(action, jnp.float32)], axis=-1))
 
 
+@functools.cache
+def fresh(spec):
+    return jax.jit(lambda key: learner.init(spec, key))(jax.random.key(6))
+
+
 def policy_of_ledger(bias):
     """Actors that give the logits (bias, -bias) whatever they see."""
 
@@ -61,7 +66,7 @@ def policy_of_ledger(bias):
         actor = jax.tree.map(jnp.zeros_like, group.actor)
         return {**actor, "bias_1": actor["bias_1"] + jnp.array([bias, -bias])}
 
-    return Policy(tuple(map(constant, learner.init(LEDGER, jax.random.key(0)))), LEDGER_HYPER, None)
+    return Policy(tuple(map(constant, fresh(LEDGER))), LEDGER_HYPER, None)
 
 
 def play_out(env, spec, policy, pairs, steps):
@@ -116,7 +121,7 @@ def on_points():
     """(spec, policy, groups, pairs) of point_reach: own critics, normalised observations, exploration noise."""
     rng = np.random.default_rng(3)
     spec = Spec.of(POINT, {"agents": IDDPG})
-    groups = learner.init(spec, jax.random.key(4))
+    groups = fresh(spec)
     statistics = Statistics(*(jnp.asarray(rng.uniform(0.1, 0.5, 12), jnp.float32) for _ in range(2)))
     hyper = HYPER._replace(gamma=0.8, exploration_noise=0.5)
     place = [jnp.asarray(rng.uniform(-1, 1, (20, *shape)), jnp.float32) for shape in ((2, 2), (2, 2), (2,), (4,))]
@@ -154,7 +159,7 @@ def test_true_values_of_box_actions():
 def test_estimates_are_the_critics():
     """Two central critics, their mean; one own critic, which reads its agent's parts."""
     pairs = pairs_of_ledger(9)
-    groups = learner.init(LEDGER, jax.random.key(6))
+    groups = fresh(LEDGER)
     got = q_bias.estimate(LEDGER, policy_of_ledger(0.0), [g.critic for g in groups], pairs.inputs)
     rows = np.asarray(pairs.inputs, np.float64)
     both = [reference.forward(layers(groups[0].critic, 0, j), rows)[0][:, 0] for j in range(2)]

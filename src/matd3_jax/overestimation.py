@@ -106,7 +106,7 @@ def draw(path: Path, metrics: Mapping[str, np.ndarray], teams: Mapping[str, Sequ
         for k, agent in enumerate(agents if len(agents) > 1 else ()):
             each = by_seed(metrics, f"{agent}_overestimation")[1].mean(axis=0)
             colour = _hex(AGENT[(k + 2) % len(AGENT)])
-            bias.plot(steps, each, color=colour, linewidth=1, label=agent)
+            bias.plot(steps, each, color=colour, linewidth=1, label=agent, zorder=3)
         _line(bias, steps, over, BLACK, f"mean of the {len(agents)} agents" if len(agents) > 1 else agents[0])
         bias.axhline(0, color="gray", linewidth=0.8)
         values.set_title(team if len(teams) > 1 else "")
