@@ -179,7 +179,7 @@ def parse(overrides: Sequence[str], sweep: bool = False) -> list[Override]:
             example = "key=value, for instance algo.lr=0.003" + (" or algo.lr=0.01,0.003" if sweep else "")
             raise UserError(f"cannot read {text!r}: write {example}") from error
         if override.is_delete() or override.is_sweep_override() and not sweep:
-            raise UserError(f"cannot take {text!r} here: write key=value with one value")
+            raise UserError(f"cannot take {text!r} here: write key=value with one value (several: matd3_jax.sweep)")
         parsed.append(override)
     return parsed
 
