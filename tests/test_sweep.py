@@ -127,6 +127,19 @@ def test_diverged_seeds_are_counted_and_come_last(swept, tmp_path):
     assert ranked[-1].interval("final")[0] == ranked[-1].final[0]  # of the seed that did not
 
 
+def test_a_sweep_that_diverged_everywhere_is_reported(swept, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(swept, copy)
+    for metrics in (copy / "runs").glob("*/metrics.csv"):
+        header, *rows = metrics.read_text().splitlines()
+        kept = len(("step", "seed", "updates", "episodes"))
+        lost = [",".join([*row.split(",")[:kept], *["nan"] * (len(row.split(",")) - kept)]) for row in rows]
+        metrics.write_text("\n".join([header, *lost]) + "\n")
+    assert sweep.main([f"resume={copy}"]) == 0
+    with (copy / "table.csv").open(newline="") as file:
+        assert [row["diverged"] for row in csv.DictReader(file)] == ["2"] * 4
+
+
 def test_stopped_and_gone_on_with_it_is_the_same_sweep(swept, tmp_path, monkeypatch, capsys):
     """A signal after the third chunk; what is left is gone on with, to the same numbers."""
     advance, calls = Training.advance, []

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from matd3_jax import outcome
 from matd3_jax.algorithms import HyperParams
 from matd3_jax.envs.colours import AGENT, BLACK, Colour
 from matd3_jax.plotting import by_seed, curve
@@ -67,8 +68,8 @@ def summary(metrics: Mapping[str, np.ndarray], agents: Sequence[str]) -> dict[st
         metrics = {name: column[trained] for name, column in metrics.items()}
     for agent in agents:
         values = {name: by_seed(metrics, f"{agent}_{name}")[1] for name in ("q_estimate", "q_true", "overestimation")}
-        found[agent] = {name: _final(curves[:, -1]) for name, curves in values.items()}
-        found[agent]["overestimation_mean"] = _final(values["overestimation"].mean(axis=1))
+        found[agent] = {name: outcome.final(curves[:, -1]) for name, curves in values.items()}
+        found[agent]["overestimation_mean"] = outcome.final(values["overestimation"].mean(axis=1))
     return found
 
 
@@ -135,8 +136,3 @@ def _line(axis, steps: np.ndarray, curves: np.ndarray, colour: Colour, label: st
 
 def _hex(colour: Colour) -> str:
     return "#{:02x}{:02x}{:02x}".format(*colour)
-
-
-def _final(values: np.ndarray) -> Final:
-    mean, half = mean_interval(values)
-    return float(mean), float(half) if len(values) > 1 else None

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from matd3_jax.plotting import by_seed
 from matd3_jax.ranking import Ranked
-from matd3_jax.runs import RunDirectory
+from matd3_jax.runs import together
 from matd3_jax.statistics import mean_interval
 
 BEST = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
@@ -41,13 +41,11 @@ def draw(path: Path, folder: Path, runs: Mapping[str, Sequence[str]], rows: Sequ
 def _curves(axis, folder: Path, runs: Mapping[str, Sequence[str]], rows: Sequence[Ranked], metric: str) -> None:
     means = []
     for k, row in reversed(list(enumerate(rows))):
-        tables = [by_seed(RunDirectory(folder / run).read_metrics(), metric) for run in runs[row.name]]
-        steps, curves = tables[0][0], np.concatenate([values for _, values in tables])
+        steps, curves = by_seed(together([folder / run for run in runs[row.name]]), metric)
         means.append(curves.mean(axis=0))
         if k >= len(BEST):
-            axis.plot(
-                steps, curves.mean(axis=0), color="0.75", linewidth=0.8, label="others" if k == len(BEST) else None
-            )
+            label = "others" if k == len(BEST) else None
+            axis.plot(steps, means[-1], color="0.75", linewidth=0.8, label=label)
             continue
         mean, half = mean_interval(curves)
         if len(curves) > 1:
@@ -58,15 +56,13 @@ def _curves(axis, folder: Path, runs: Mapping[str, Sequence[str]], rows: Sequenc
     axis.set_xlabel("env steps of each seed")
     axis.set_ylabel(metric)
     axis.set_title("mean over seeds, 95 % interval", fontsize=10)
-    axis.set_ylim(*_limits(np.concatenate(means)))
+    # A range that holds all means: intervals of few seeds reach far beyond what there is to see.
+    finite = np.concatenate(means)
+    finite = finite[np.isfinite(finite)]
+    if finite.size:  # not where everything diverged
+        room = 0.1 * (np.ptp(finite) or 1.0)
+        axis.set_ylim(finite.min() - room, finite.max() + room)
     _clean(axis)
-
-
-def _limits(means: np.ndarray) -> tuple[float, float]:
-    """A range that holds all means: intervals of few seeds reach far beyond what there is to see."""
-    low, high = np.nanmin(means), np.nanmax(means)
-    room = 0.1 * (high - low or 1.0)
-    return float(low - room), float(high + room)
 
 
 def _values(axis, key: str, rows: Sequence[Ranked], metric: str) -> None:
