@@ -1,7 +1,6 @@
 """How much memory training takes, computed before anything is allocated."""
 
 import math
-from collections.abc import Sequence
 
 import chex
 import jax
@@ -33,8 +32,8 @@ def seed_bytes(trainer: Trainer) -> int:
     """Bytes of one seed beside its replay: its state, twice while it changes, and a collect with its fresh starts."""
     schedule, spec = trainer.schedule, trainer.spec
     state = trainer.abstract_state()
-    whole = _bytes(state._replace(replay=None, collects=None)) // trainer.rows  # type: ignore[arg-type]
-    one_env = _bytes(state.env) // (trainer.rows * schedule.num_envs)
+    whole = size(state._replace(replay=None, collects=None)) // trainer.rows  # type: ignore[arg-type]
+    one_env = size(state.env) // (trainer.rows * schedule.num_envs)
     # Each transition of a collect: its row, what it is packed from, and a fresh start.
     return 2 * whole + schedule.collect_steps * (2 * 4 * spec.row_size + 2 * one_env)
 
@@ -75,11 +74,12 @@ def fitting_seeds(config: Config, budget: int) -> int:
     return most_seeds(Training(config).trainer, budget)
 
 
-def _bytes(tree: chex.ArrayTree) -> int:
-    def size(leaf) -> int:
+def size(tree: chex.ArrayTree) -> int:
+    """Bytes of all leaves, arrays or their shapes."""
+
+    def one(leaf) -> int:
         if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             leaf = jax.eval_shape(jax.random.key_data, leaf)
         return leaf.size * leaf.dtype.itemsize
 
-    leaves: Sequence = jax.tree.leaves(tree)
-    return sum(map(size, leaves))
+    return sum(map(one, jax.tree.leaves(tree)))

@@ -1,0 +1,321 @@
+"""`python -m benchmarks.limits`: what this machine could do at most: the least time of one cycle of training.
+
+    python -m benchmarks.limits [seeds=20] [repeats=5] [out=FILE.json] [key=value ...]
+
+Other keys are settings of the run, as `python -m matd3_jax.train` takes them. Measured in the same run, on the same
+devices: the rate of every matrix product of the loop, by itself and at its own shape (batched over seeds, agents and
+twins as the loop has them; on one device alone, and on all at once), and the memory's bandwidth. From these and the
+products of one cycle, counted by hand and again in the compiled program, follows the floor: the time that the
+products alone take, or the bytes that must be moved at least, whichever is more. Nothing else is in it: no bias, no
+ReLU, no random numbers, no sampling, no optimiser, no environment.
+"""
+
+import dataclasses
+import json
+import math
+import re
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks import throughput
+from matd3_jax import command, config, devices, learner, memory
+from matd3_jax.spec import Group
+from matd3_jax.trainer import Trainer
+from matd3_jax.training import Training
+
+DEFAULTS: dict[str, Any] = {"seeds": 20, "repeats": 5, "out": None}
+
+
+@dataclasses.dataclass(frozen=True)
+class Product:
+    """A kind of matrix product: `equation` as einsum takes it, of operands with these shapes."""
+
+    equation: str
+    left: tuple[int, ...]
+    right: tuple[int, ...]
+
+    @property
+    def flops(self) -> int:
+        """Two for each multiplication and addition."""
+        names = self.equation.split("->")[0].replace(",", "")
+        return 2 * math.prod(dict(zip(names, self.left + self.right, strict=True)).values())
+
+
+@dataclasses.dataclass(frozen=True)
+class Floor:
+    """The least time of one cycle of all seeds together, seconds."""
+
+    alone: float
+    """Products, every device as fast as it is when the others rest."""
+    together: float
+    """Products, all devices at once."""
+    moved: float
+    """Bytes that must be read or written, all devices at once."""
+    flops: float
+    """Of the products of one cycle, all seeds."""
+
+    @property
+    def seconds(self) -> float:
+        return max(self.alone, self.moved)
+
+    @property
+    def gflops(self) -> float:
+        """Giga floating point operations a second of the products of the loop, every device as when alone."""
+        return self.flops / self.alone / 1e9
+
+
+# ---- counted by hand -------------------------------------------------------------------------------------------------
+
+
+def products(trainer: Trainer) -> dict[Product, float]:
+    """How many of each product one device does in one cycle."""
+    schedule, spec = trainer.schedule, trainer.spec
+    found: dict[Product, float] = {}
+    local = trainer.rows // trainer.mesh.size
+    updates = trainer.cycle_collects * schedule.updates_per_collect
+    for group in spec.groups:
+        together = trainer.piece * (1 if trainer.on_cpu else len(group.members))
+        times = local * len(group.members) / together * updates
+        for part, share in _update(trainer, group):
+            batched = _batched(part, together)
+            found[batched] = found.get(batched, 0) + times * share
+        sizes = (group.observation_size, *group.algorithm.hidden, group.action_space.size)
+        for part in _forward((local, len(group.members)), schedule.num_envs, sizes):
+            found[part] = found.get(part, 0) + trainer.cycle_collects * schedule.rollout_length
+    return found
+
+
+def _update(trainer: Trainer, group: Group) -> Iterator[tuple[Product, float]]:
+    """(product, how many an update) of one agent of the group: see `learner._update_agent`."""
+    spec, algorithm, batch = trainer.spec, group.algorithm, trainer.schedule.batch_size
+    hidden, delay = algorithm.hidden, algorithm.policy_delay
+    central = algorithm.critic == "central"
+    # With one minibatch for all, the members of a group share their target actions.
+    shared = len(group.members) if trainer.schedule.shared_minibatch and central else 1
+    for other in spec.groups if central else (group,):
+        sizes = (other.observation_size, *other.algorithm.hidden, other.action_space.size)
+        members = (len(other.members),) if central else ()
+        yield from ((part, 1 / shared) for part in _forward(members, batch, sizes))
+    critic = (learner.critic_input_size(spec, group), *hidden, 1)
+    twins = algorithm.num_critics
+    forward = [*_wide(twins, batch, critic), *_forward((twins,), batch, critic)[1:]]
+    yield from ((part, 2) for part in forward)  # targets, and the critics themselves
+    yield Product("bi,bo->io", (batch, critic[0]), (batch, twins * critic[1])), 1
+    yield from ((part, 1) for part in _backward((twins,), batch, critic)[1:])
+    k = group.action_space.size
+    actor = (group.observation_size, *hidden, k)
+    yield from ((part, 1 / delay) for part in _forward((), batch, actor) + _forward((1,), batch, critic))
+    yield Product("bi,io->bo", (batch, k), (k, critic[1])), 1 / delay  # the own action's change
+    yield Product("bo,io->bi", (batch, critic[1]), (k, critic[1])), 1 / delay
+    yield from ((part, 1 / delay) for part in _backward((1,), batch, critic)[1:] if part.equation.endswith("bi"))
+    yield from ((part, 1 / delay) for part in _backward((), batch, actor))
+
+
+def _forward(stack: tuple[int, ...], batch: int, sizes: Sequence[int]) -> list[Product]:
+    """The products of perceptrons' layers, [*stack, batch, i] times [*stack, i, o]."""
+    s = "st"[: len(stack)]
+    return [
+        Product(f"{s}bi,{s}io->{s}bo", (*stack, batch, i), (*stack, i, o))
+        for i, o in zip(sizes[:-1], sizes[1:], strict=True)
+    ]
+
+
+def _wide(stack: int, batch: int, sizes: Sequence[int]) -> list[Product]:
+    """The first layers of a stack that reads the same input: one wide product."""
+    return [Product("bi,io->bo", (batch, sizes[0]), (sizes[0], stack * sizes[1]))]
+
+
+def _backward(stack: tuple[int, ...], batch: int, sizes: Sequence[int]) -> list[Product]:
+    """Gradients of every layer's kernel, and of the inputs of all but the first; products with a vector of length one
+    on the way back are scalings, no products."""
+    s = "st"[: len(stack)]
+    kernels, inputs = [], []
+    for layer, (i, o) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+        kernels.append(Product(f"{s}bi,{s}bo->{s}io", (*stack, batch, i), (*stack, batch, o)))
+        if layer > 0 and o > 1:
+            inputs.append(Product(f"{s}bo,{s}io->{s}bi", (*stack, batch, o), (*stack, i, o)))
+    return kernels + inputs
+
+
+def _batched(product: Product, together: int) -> Product:
+    """The product for several seeds (and members) at once."""
+    if together == 1:
+        return product
+    left, right = product.equation.split("->")[0].split(",")
+    out = product.equation.split("->")[1]
+    return Product(f"n{left},n{right}->n{out}", (together, *product.left), (together, *product.right))
+
+
+def least_bytes(trainer: Trainer) -> int:
+    """Bytes of one cycle, all seeds, that cannot stay in a cache: minibatches read from the replay, new rows written,
+    networks and optimisers read and written once an update (twice for what is moved along)."""
+    schedule, spec = trainer.schedule, trainer.spec
+    batches = 1 if schedule.shared_minibatch else spec.num_agents
+    rows = 4 * spec.row_size * (batches * schedule.batch_size * schedule.updates_per_collect + schedule.collect_steps)
+    state = memory.size(trainer.abstract_state().groups) // trainer.rows
+    return trainer.rows * trainer.cycle_collects * (rows + 2 * state * schedule.updates_per_collect)
+
+
+# ---- counted in the compiled program ---------------------------------------------------------------------------------
+
+
+def counted_flops(text: str) -> float:
+    """Floating point operations of the matrix products in a compiled program (HLO text as `Compiled.as_text` gives it),
+    loops as often as they run. Raises ValueError where XLA does not say how often."""
+    bodies: dict[str, list[str]] = {}
+    entry = name = ""
+    for line in text.splitlines():
+        head = re.match(r"(ENTRY )?%?([\w.\-]+) .*\{$", line)
+        if head and not line.startswith(" "):
+            name = head[2]
+            bodies[name] = []
+            entry = name if head[1] else entry
+        elif name:
+            bodies[name].append(line)
+    shape = re.compile(r"%?([\w.\-]+) = \w+\[([\d,]*)\]")
+    totals: dict[str, float] = {}
+
+    def total(name: str) -> float:
+        if name in totals:
+            return totals[name]
+        sizes = {m[1]: _numbers(m[2]) for m in map(shape.search, bodies[name]) if m}
+        flops = 0.0
+        for line in bodies[name]:
+            dot = re.search(r" dot\(%?([\w.\-]+),.*lhs_contracting_dims=\{([\d,]*)\}", line)
+            if dot:
+                out = shape.search(line)
+                contracted = math.prod(sizes[dot[1]][d] for d in _numbers(dot[2]))
+                flops += 2 * math.prod(_numbers(out[2])) * contracted  # type: ignore[index]
+            called = re.findall(r"(?:calls|to_apply|body|condition)=%?([\w.\-]+)", line)
+            times = 1
+            if " while(" in line:
+                count = re.search(r'"known_trip_count":\{"n":"(\d+)"', line)
+                if not count and any(total(c) for c in called):
+                    raise ValueError(f"a loop with products in it and no known count: {line.strip()[:120]}")
+                times = int(count[1]) if count else 1
+            flops += times * sum(total(c) for c in called)
+        totals[name] = flops
+        return flops
+
+    return total(entry)
+
+
+def _numbers(text: str) -> list[int]:
+    return [int(n) for n in text.split(",") if n]
+
+
+def compiled_flops(trainer: Trainer) -> float:
+    """`counted_flops` of one cycle of all seeds; nan on accelerators, whose products are calls into libraries."""
+    if not trainer.on_cpu:
+        return math.nan
+    state = trainer.abstract_state()
+    shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.spec.row_size)
+    state = state._replace(replay=jax.ShapeDtypeStruct(shape, jnp.float32))
+    cycles = 2  # a loop that runs once may be unrolled
+    text = trainer.chunk(cycles).jitted.lower(state, trainer.hyper).compile().as_text()
+    return counted_flops(text) / cycles * trainer.mesh.size
+
+
+# ---- measured --------------------------------------------------------------------------------------------------------
+
+
+def seconds(product: Product, count: int, repeats: int = 5) -> float:
+    """Seconds of one product on each of `count` devices at the same time, median. Operands come one after the other
+    from a set of eight, so that they are no warmer in cache than what the loop has just computed."""
+    found = jax.devices()[:count]
+    mesh = jax.sharding.Mesh(np.array(found), ("devices",))
+    spec = jax.sharding.PartitionSpec("devices")
+    sets = 8
+    rounds = max(1, round(0.02 * 50e9 / (product.flops * sets)))
+
+    def rounds_of(left, right):
+        def one(total, operands):
+            return total + jnp.einsum(product.equation, *operands).ravel()[0], None
+
+        return jax.lax.scan(lambda t, _: jax.lax.scan(one, t, (left[0], right[0])), jnp.zeros(()), None, rounds)[0]
+
+    program = jax.jit(
+        jax.shard_map(lambda a, b: rounds_of(a, b)[None], mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+    )
+    left, right = (
+        jax.device_put(np.full((count, sets, *shape), 0.01, np.float32), jax.sharding.NamedSharding(mesh, spec))
+        for shape in (product.left, product.right)
+    )
+    return _median(lambda: program(left, right), repeats) / (rounds * sets)
+
+
+def bandwidth(repeats: int = 5, mebibytes: int = 256) -> float:
+    """Bytes a second that all devices together read and write (x + 1 over an array far larger than any cache)."""
+    mesh = jax.sharding.Mesh(np.array(jax.devices()), ("devices",))
+    spec = jax.sharding.PartitionSpec("devices")
+    x = jax.device_put(
+        np.zeros((jax.device_count(), mebibytes * 2**18), np.float32), jax.sharding.NamedSharding(mesh, spec)
+    )
+    program = jax.jit(jax.shard_map(lambda x: x + 1, mesh=mesh, in_specs=spec, out_specs=spec))
+    return 2 * x.nbytes / _median(lambda: program(x), repeats)
+
+
+def _median(call: Callable[[], Any], repeats: int) -> float:
+    jax.block_until_ready(call())
+    times = []
+    for _ in range(repeats):
+        begun = time.perf_counter()
+        jax.block_until_ready(call())
+        times.append(time.perf_counter() - begun)
+    return float(np.median(times))
+
+
+def floor(trainer: Trainer, repeats: int = 5) -> tuple[Floor, list[dict[str, Any]]]:
+    """The floor of one cycle, and a row for every kind of product: its share and its rates."""
+    devices_used = trainer.mesh.size
+    rows = []
+    for product, count in products(trainer).items():
+        alone = seconds(product, 1, repeats)
+        together = seconds(product, devices_used, repeats) if devices_used > 1 else alone
+        rows.append({
+            "equation": product.equation, "left": product.left, "right": product.right, "count": count,
+            "flops": product.flops, "seconds_alone": alone, "seconds_together": together,
+        })  # fmt: skip
+    flops = devices_used * sum(row["count"] * row["flops"] for row in rows)
+    alone, together = (sum(row["count"] * row[f"seconds_{how}"] for row in rows) for how in ("alone", "together"))
+    return Floor(alone, together, least_bytes(trainer) / bandwidth(repeats), flops), rows
+
+
+def main(argv: Sequence[str]) -> int:
+    devices.prepare()
+    taken, overrides = config.take(argv, tuple(DEFAULTS))
+    options = {**DEFAULTS, **taken}
+    settings = config.load([f"seeds={options['seeds']}", "total_steps=100000", "eval_every=0", *overrides])
+    trainer = Training(settings).trainer
+    report: dict[str, Any] = {"machine": devices.description(), "versions": devices.versions()}
+    report |= {"commit": throughput.commit(), "settings": list(argv)}
+    found, rows = floor(trainer, options["repeats"])
+    for row in sorted(rows, key=lambda row: -row["count"] * row["seconds_alone"]):
+        shapes = f"{row['equation']:<14} {list(row['left'])} {list(row['right'])}"
+        print(f"{shapes:<56} {row['flops'] / row['seconds_alone'] / 1e9:8.1f} GFLOP/s alone "
+              f"{row['flops'] / row['seconds_together'] / 1e9:8.1f} each of {trainer.mesh.size} at once   "
+              f"{row['count'] * row['seconds_alone'] / found.alone:6.1%} of the floor")  # fmt: skip
+    steps = trainer.num_seeds * trainer.cycle_steps
+    counted = compiled_flops(trainer)
+    report |= {"floor": dataclasses.asdict(found), "products": rows, "flops_in_compiled_program": counted}
+    report["env_steps_per_second"] = steps / found.seconds
+    print(f"products of one env step: {found.flops / steps / 1e6:.3f} MFLOP by hand, "
+          f"{counted / steps / 1e6:.3f} in the compiled program")  # fmt: skip
+    print(f"least time of a cycle ({steps:,} env steps): products {found.alone * 1e3:.2f} ms (devices as when alone; "
+          f"{found.together * 1e3:.2f} all at once), memory {found.moved * 1e3:.2f} ms")  # fmt: skip
+    print(f"at most {steps / found.seconds:,.0f} env steps/s, at {found.gflops:.0f} GFLOP/s")
+    if options["out"] is not None:
+        Path(options["out"]).write_text(json.dumps(report, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.argv[0] = "limits"
+    command.run(main)
