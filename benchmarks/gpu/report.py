@@ -1,0 +1,85 @@
+"""What was measured, kept in one file from case to case: a run that is cut off loses only the case it was in."""
+
+import gc
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from benchmarks import throughput
+from matd3_jax import devices
+
+Row = dict[str, Any]
+
+
+class Report:
+    """The file report.json in `out`: facts of the machine, and for each part its cases by name.
+
+    Args:
+        out: made if it is not there. What an earlier run on the same kind of machine left there is kept, and measured
+            cases are not measured again.
+        minutes: start no case after so many.
+    """
+
+    def __init__(self, out: Path, minutes: float):
+        out.mkdir(parents=True, exist_ok=True)
+        self.out, self.file = out, out / "report.json"
+        self.end = time.monotonic() + 60 * minutes
+        facts = {"machine": devices.description(), "versions": devices.versions(), "commit": throughput.commit()}
+        before = json.loads(self.file.read_text()) if self.file.exists() else {}
+        same = before.get("machine", {}).get("devices") == facts["machine"]["devices"]  # type: ignore[index]
+        self.parts: dict[str, dict[str, Row]] = before["parts"] if same else {}
+        self.facts = facts
+        self.left: list[str] = []
+        """Cases for which no time was left."""
+        self.wrong: list[str] = []
+        """What the checks found."""
+
+    def case(self, part: str, name: str, measure: Callable[[], Row]) -> Row | None:
+        """What `measure` gives, measured now unless it has been; None where it failed or no time was left.
+
+        One that fails (memory, an option that this version does not know) is noted and must not stop the others.
+        """
+        found = self.parts.get(part, {}).get(name)
+        if found is not None and "failed" not in found:
+            return found
+        if time.monotonic() > self.end:
+            self.left.append(f"{part}: {name}")
+            return None
+        begun = time.monotonic()
+        try:
+            row = measure()
+        except Exception as error:
+            row = {"failed": f"{type(error).__name__}: {' '.join(str(error).split())[:500]}"}
+            gc.collect()  # the error's frames held arrays
+        row["took_seconds"] = round(time.monotonic() - begun, 1)
+        self.parts.setdefault(part, {})[name] = row
+        self.save()
+        print(f"{part}: {name}: {told(row)}", flush=True)
+        return None if "failed" in row else row
+
+    def get(self, part: str, name: str) -> Row | None:
+        """A measured case."""
+        found = self.parts.get(part, {}).get(name)
+        return None if found is None or "failed" in found else found
+
+    def rows(self, part: str) -> dict[str, Row]:
+        """The measured cases of a part by name."""
+        return {name: row for name, row in self.parts.get(part, {}).items() if "failed" not in row}
+
+    def save(self) -> None:
+        partial = self.file.with_suffix(".partial")
+        partial.write_text(json.dumps({**self.facts, "parts": self.parts}, indent=1) + "\n")
+        partial.replace(self.file)
+
+
+def told(row: Row) -> str:
+    """A row on one line; lists and groups are left to the file."""
+    return ", ".join(f"{key} {number(value)}" for key, value in row.items() if not isinstance(value, list | dict))
+
+
+def number(value: Any) -> str:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return str(value)
+    return f"{value:,.0f}" if abs(value) >= 100 or value == round(value) else f"{value:.3g}"
