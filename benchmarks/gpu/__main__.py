@@ -8,10 +8,10 @@ Parts, in this order; docs/performance.md says what each takes:
     floor       rates of products and of memory
     launches    kernels of a cycle, and the share of the time in which none runs
     seeds       env steps/s over 1 to 1,024 seeds: whole loop, update, rollout
-    precision   float32 products beside TF32
+    precision   float32 products beside the device's own (TF32), wall_clock too
+    ant         whole loop of six seeds over environments, its launches, the physics alone, exact and fast
     unroll      longer bodies of the loops
     draws       random number generators, one draw a cycle
-    ant         whole loop of six seeds over environments, the physics alone, exact and fast
     options     command buffers, autotuning
 Everything is kept in DIR/report.json after each case, and what is there is not measured again: a run that was cut off
 goes on where it stood, and parts can be run one by one. No case begins after `minutes`. A check that fails stops
@@ -35,9 +35,9 @@ PARTS: dict[str, Callable[[Report, float, Length], None]] = {
     "launches": launches.run,
     "seeds": seeds.run,
     "precision": variants.precision,
+    "ant": ant.run,
     "unroll": variants.unroll,
     "draws": variants.draws,
-    "ant": ant.run,
     "options": variants.options,
 }
 DEFAULTS = {"out": None, "parts": list(PARTS), "minutes": 60, "scale": 1.0}

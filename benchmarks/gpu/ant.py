@@ -1,7 +1,7 @@
-"""Env steps/s of the Ant: the physics over environments, and the whole loop of six seeds."""
+"""Env steps/s of the Ant: the whole loop of six seeds, its launches, and the physics alone over environments."""
 
 from benchmarks import robots
-from benchmarks.gpu import stretch
+from benchmarks.gpu import launches, stretch
 from benchmarks.gpu.report import Report, Row
 from benchmarks.gpu.stretch import Length
 
@@ -16,6 +16,8 @@ def run(report: Report, scale: float, length: Length) -> None:
     # 20 environments are the wide schedule, a GPU's default.
     for num_envs in (128, 20, 1024) if scale >= 1 else (20,):
         report.case("ant", f"loop, exact, {num_envs}", lambda n=num_envs: loop(seeds, n, few))
+    # The same program as above, hence from the compilation cache.
+    report.case("launches", "ant, 20 environments", lambda: launches.measure(settings(20, seeds), few))
     for physics, counts in (("exact", (128, 1024, 8192)), ("fast", (1024, 8192))):
         for num_envs in counts if scale >= 1 else (4,):
             name = f"physics, {physics}, {num_envs}"

@@ -17,7 +17,7 @@ PRECISIONS = {"default": None, "float32": "highest", "TF32": "tensorfloat32"}
 """Values of `jax_default_matmul_precision`. JAX leaves open what the default is; GPUs since NVIDIA's Ampere take TF32,
 CPUs float32 for all three."""
 
-PRODUCT, UPDATE, POSITION, VELOCITY = 5e-6, 2e-2, 1e-5, 2e-3
+PRODUCT, UPDATE, POSITION, VELOCITY = 5e-6, 1e-3, 1e-5, 2e-3
 """Errors allowed."""
 
 

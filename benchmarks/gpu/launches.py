@@ -10,7 +10,7 @@ from typing import Any
 import jax
 from jax.profiler import ProfileData, ProfileOptions
 
-from benchmarks.gpu import ant, seeds, stretch
+from benchmarks.gpu import seeds, stretch
 from benchmarks.gpu.report import Report, Row
 from benchmarks.gpu.stretch import Compiled, Length
 from matd3_jax.trainer import TrainState
@@ -28,9 +28,6 @@ def run(report: Report, scale: float, length: Length) -> None:
         capacity = 100_000 if scale >= 1 else 10_000
         line = seeds.settings(count, capacity)
         report.case("launches", f"simple_spread, {count} seeds", lambda line=line: measure(line, few))
-    robot = ant.settings(20, ant.SEEDS if scale >= 1 else 1)
-    if scale >= 1:
-        report.case("launches", "ant, 20 environments", lambda: measure(robot, few._replace(cycles=2)))
 
 
 def measure(overrides: list[str], length: Length) -> Row:

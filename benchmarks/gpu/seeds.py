@@ -14,9 +14,9 @@ SHARE = 0.85
 
 
 def run(report: Report, scale: float, length: Length) -> None:
-    counts = [1, 4, 20, 64, 256, 1024] if scale >= 1 else [1, 2]
+    some, more = ([1, 20, 256, 1024], [4, 64]) if scale >= 1 else ([1, 2], [])
     # The whole loop first: what a run that is cut off should have.
-    for part in ("loop", "update", "rollout"):
+    for part, counts in {"loop": sorted(some + more), "update": some, "rollout": some}.items():
         for seeds in counts:
             report.case("seeds", f"{seeds}, {part}", lambda s=seeds, p=part: measure(s, p, scale, length))
 

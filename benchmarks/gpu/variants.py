@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from benchmarks.gpu import seeds, stretch
+from benchmarks.gpu import seeds, stretch, wall_clock
 from benchmarks.gpu.checks import PRECISIONS
 from benchmarks.gpu.report import Report, Row
 from benchmarks.gpu.stretch import Length
@@ -50,6 +50,7 @@ def precision(report: Report, scale: float, length: Length) -> None:
         for name in ("default", "float32"):
             context = partial(jax.default_matmul_precision, PRECISIONS[name])
             _case(report, "precision", f"{count} seeds, {name}", line(scale, count), length, context)
+    wall_clock.case(report, scale, "float32")  # does it learn otherwise?
 
 
 def unroll(report: Report, scale: float, length: Length) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from benchmarks.gpu.checks import PRECISIONS
 from benchmarks.gpu.report import Report, Row
 from experiments import figures, tidy
 from experiments.tidy import Table
@@ -22,8 +23,12 @@ POINTS = (5_000, 10_000, 20_000, 40_000, 60_000)
 
 
 def run(report: Report, scale: float) -> None:
-    for name, precision in (("default", None), ("float32", "highest")):
-        report.case("wall_clock", name, lambda n=name, p=precision: measure(n, p, scale, report.out))
+    case(report, scale, "default")
+
+
+def case(report: Report, scale: float, precision: str) -> None:
+    """One of `checks.PRECISIONS`, and the picture of all so far."""
+    report.case("wall_clock", precision, lambda: measure(precision, PRECISIONS[precision], scale, report.out))
     draw(report.out)
 
 
@@ -65,12 +70,12 @@ def recorded() -> Table:
 
 
 def beside(ours: Table, theirs: Table) -> list[Row]:
-    """Mean returns of the last 1,000 episodes at `POINTS` and at the end, ours less theirs with the 95 % interval of
-    the difference and its p-value, of which chance alone brings one in twenty below 0.05."""
+    """Mean returns of the last 1,000 episodes at `POINTS` (of a shorter run at its end), ours less theirs with the 95 %
+    interval of the difference and its p-value, of which chance alone brings one in twenty below 0.05."""
     (episodes, values), (their_episodes, their_values) = trailing(ours), trailing(theirs)
     end = min(episodes[-1], their_episodes[-1])
     found = []
-    for point in sorted({*(p for p in POINTS if p <= end), int(end)}):
+    for point in [p for p in POINTS if p <= end] or [int(end)]:
         a = np.array([np.interp(point, episodes, curve) for curve in values])
         b = np.array([np.interp(point, their_episodes, curve) for curve in their_values])
         test = statistics.compare(a, b)

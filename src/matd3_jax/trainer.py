@@ -214,7 +214,7 @@ class Trainer:
         def one(policy, env, key):
             length, kept = self.schedule.rollout_length, self.q_bias_pairs > 0
             return rollout.collect(
-                self.env, self.spec, policy, env, key, length, random, keep_states=kept, unroll=self.unroll_steps
+                self.env, self.spec, policy, env, key, length, random=random, keep_states=kept, unroll=self.unroll_steps
             )
 
         keys = jax.vmap(partial(jax.random.split, num=2))(state.key)
