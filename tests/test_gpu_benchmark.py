@@ -10,6 +10,7 @@ from benchmarks.gpu import launches, seeds, targets, wall_clock
 from benchmarks.gpu.report import Report
 from experiments.tidy import Table
 from matd3_jax import config, memory
+from matd3_jax.errors import UserError
 from matd3_jax.training import Training
 
 # Times in us. Stream 7: 0-2 and 5-6; stream 8: 1-3, a copy 5.5-7.5. Together 0-3 and 5-7.5: 5.5 of 7.5. Line 3 shows
@@ -86,7 +87,8 @@ def test_report_goes_on_where_it_was_cut_off(tmp_path):
     stored = json.loads((tmp_path / "report.json").read_text())
     stored["machine"]["devices"] = ["gpu:0 another"]
     (tmp_path / "report.json").write_text(json.dumps(stored))
-    assert not Report(tmp_path, minutes=1).parts, "numbers of another device do not count"
+    with pytest.raises(UserError, match="another; take another directory"):
+        Report(tmp_path, minutes=1)
 
 
 def test_targets(tmp_path):

@@ -9,6 +9,7 @@ from typing import Any
 
 from benchmarks import throughput
 from matd3_jax import devices
+from matd3_jax.errors import UserError
 
 Row = dict[str, Any]
 
@@ -17,9 +18,10 @@ class Report:
     """The file report.json in `out`: facts of the machine, and for each part its cases by name.
 
     Args:
-        out: made if it is not there. What an earlier run on the same kind of machine left there is kept, and measured
-            cases are not measured again.
+        out: made if it is not there. What an earlier run left there is kept, and measured cases are not measured again.
         minutes: start no case after so many.
+
+    Raises UserError where `out` holds numbers of other devices.
     """
 
     def __init__(self, out: Path, minutes: float):
@@ -28,9 +30,11 @@ class Report:
         self.end = time.monotonic() + 60 * minutes
         facts = {"machine": devices.description(), "versions": devices.versions(), "commit": throughput.commit()}
         before = json.loads(self.file.read_text()) if self.file.exists() else {}
-        same = before.get("machine", {}).get("devices") == facts["machine"]["devices"]  # type: ignore[index]
-        self.parts: dict[str, dict[str, Row]] = before["parts"] if same else {}
-        self.facts = facts
+        self.facts: Row = facts
+        self.parts: dict[str, dict[str, Row]] = before.get("parts", {})
+        devices_before = before.get("machine", self.facts["machine"])["devices"]
+        if devices_before != self.facts["machine"]["devices"]:
+            raise UserError(f"out={out}: holds numbers of {', '.join(devices_before)}; take another directory")
         self.left: list[str] = []
         """Cases for which no time was left."""
         self.wrong: list[str] = []
@@ -53,7 +57,7 @@ class Report:
         except Exception as error:
             row = {"failed": f"{type(error).__name__}: {' '.join(str(error).split())[:500]}"}
             gc.collect()  # the error's frames held arrays
-        row["took_seconds"] = round(time.monotonic() - begun, 1)
+        row |= {"took_seconds": round(time.monotonic() - begun, 1), "commit": self.facts["commit"]}
         self.parts.setdefault(part, {})[name] = row
         self.save()
         print(f"{part}: {name}: {told(row)}", flush=True)
@@ -75,8 +79,9 @@ class Report:
 
 
 def told(row: Row) -> str:
-    """A row on one line; lists and groups are left to the file."""
-    return ", ".join(f"{key} {number(value)}" for key, value in row.items() if not isinstance(value, list | dict))
+    """A row on one line; lists and what is the same for all are left to the file."""
+    shown = {key: value for key, value in row.items() if not isinstance(value, list | dict) and key != "commit"}
+    return ", ".join(f"{key} {number(value)}" for key, value in shown.items())
 
 
 def number(value: Any) -> str:

@@ -1,6 +1,6 @@
 """The same loop computed otherwise: precision of the products, longer loop bodies, XLA's options, random numbers."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any
@@ -78,7 +78,7 @@ def _case(
     name: str,
     overrides: list[str],
     length: Length,
-    context: partial[AbstractContextManager] | type[nullcontext] = nullcontext,
+    context: Callable[[], AbstractContextManager] = nullcontext,
     **how: Any,
 ) -> None:
     def measure() -> Row:
@@ -88,7 +88,7 @@ def _case(
     report.case(part, name, measure)
 
 
-def draw(overrides: list[str], large: bool, seconds: float, context: partial[AbstractContextManager]) -> Row:
+def draw(overrides: list[str], large: bool, seconds: float, context: Callable[[], AbstractContextManager]) -> Row:
     """Seconds for as many Gumbel numbers as a cycle of all seeds takes: in a draw for each use of each update and
     collect, or in one for each seed."""
     with context():
