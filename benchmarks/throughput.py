@@ -76,14 +76,7 @@ def measure(
     trainer = training.trainer
     state, _ = training.start()
     rows = []
-    parts: dict[str, Callable[[TrainState, Any], Any]] = {
-        "environment": lambda s, h: _env_steps(trainer, s),
-        "rollout": lambda s, h: _collects(trainer, s, h),
-        "replay": lambda s, h: _gathers(trainer, s, h),
-        "update": lambda s, h: _updates(trainer, s, h),
-        "loop": trainer.cycle,
-    }
-    for part, cycle in parts.items():
+    for part, cycle in parts(trainer).items():
         if wanted is not None and part not in wanted:
             continue
         # Cycles in one call: first a guess, then as many as take the wanted time; where compiling is dear (robots), the
@@ -124,6 +117,17 @@ def measure(
             }
         )
     return rows
+
+
+def parts(trainer: Trainer) -> dict[str, Callable[[TrainState, Any], Any]]:
+    """What `Trainer.program` repeats for each part of the loop, by the part's name."""
+    return {
+        "environment": lambda s, h: _env_steps(trainer, s),
+        "rollout": lambda s, h: _collects(trainer, s, h),
+        "replay": lambda s, h: _gathers(trainer, s, h),
+        "update": lambda s, h: _updates(trainer, s, h),
+        "loop": trainer.cycle,
+    }
 
 
 def matmul_gflops(repeats: int = 7) -> float:

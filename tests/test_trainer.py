@@ -273,11 +273,12 @@ def test_seed_alone():
 
 
 @pytest.mark.skipif(len(jax.devices()) < 2, reason="one device")
-def test_devices_and_pieces_and_chunks():
-    """An odd number of seeds on one device, two at a time, in one long chunk: as on two devices, in three chunks."""
+def test_devices_and_pieces_and_chunks_and_unrolling():
+    """An odd number of seeds on one device, updated together, in one long chunk whose loops hold several cycles and
+    steps in an iteration: as on two devices, in three chunks."""
     several, states, _, metrics = main_run()
     assert several.mesh.size == 2 and several.rows == 4
-    trainer = make([0, 1, 2], tau=1.0, devices=jax.devices()[:1], piece=3)
+    trainer = make([0, 1, 2], tau=1.0, devices=jax.devices()[:1], piece=3, unroll=2, unroll_steps=3)
     state, long = trainer.chunk(3)(back(states[0], slice(0, 3)))
     same(plain(state), states[3], slice(0, 3), slice(0, 3))
     short = jax.tree.map(lambda *m: np.concatenate(m, axis=1)[:3], *metrics)

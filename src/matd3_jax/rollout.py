@@ -71,6 +71,7 @@ def collect(
     length: int,
     random: bool = False,
     keep_states: bool = False,
+    unroll: int = 1,
 ) -> tuple[EnvState, chex.Array, Episodes, Any]:
     """Play `length` steps in every environment with the exploring policies; episodes that end start anew.
 
@@ -78,7 +79,7 @@ def collect(
     where an episode ended), what ended on the way, and the state of the environment before each row's action, leading
     axis [length * num_envs] (None unless `keep_states`).
 
-    random: act uniformly at random instead: warm-up without the policies.
+    random: act uniformly at random instead: warm-up without the policies. unroll: steps that one iteration holds.
     """
     num_envs = env_state.episode_step.shape[0]
     noise_key, step_key, reset_key = jax.random.split(key, 3)
@@ -109,7 +110,7 @@ def collect(
     step_keys, reset_keys = (jax.random.split(k, (length, num_envs)) for k in (step_key, reset_key))
     # Every step has a fresh start at hand, drawn in one batch: inside the loop they would be as many, drawn one by one.
     fresh = jax.vmap(jax.vmap(env.reset))(reset_keys)
-    env_state, (rows, episodes, states) = jax.lax.scan(step, env_state, (noise, step_keys, fresh))
+    env_state, (rows, episodes, states) = jax.lax.scan(step, env_state, (noise, step_keys, fresh), unroll=unroll)
     rows, states = jax.tree.map(lambda leaf: leaf.reshape(length * num_envs, *leaf.shape[2:]), (rows, states))
     return env_state, rows, jax.tree.map(lambda e: e.sum(axis=0), episodes), states
 

@@ -61,6 +61,9 @@ class Trainer:
             replay keeps them as they are.
         q_bias_pairs: states and actions that each seed keeps for `measure_q_bias`; 0: none, and no trace of it in the
             programs.
+        unroll: cycles of a chunk, and updates of a collect with many, that one iteration of their loop holds; longer
+            iterations are more to compile and fewer launches of an accelerator. The numbers stay the same.
+        unroll_steps: the same of the env steps of a collect.
     """
 
     def __init__(
@@ -74,8 +77,11 @@ class Trainer:
         piece: int | None = None,
         normalise_observations: bool = False,
         q_bias_pairs: int = 0,
+        unroll: int = 1,
+        unroll_steps: int = 1,
     ):
         self.env, self.spec, self.schedule, self.num_seeds = env, spec, schedule, num_seeds
+        self.unroll, self.unroll_steps = unroll, unroll_steps
         self.normalise_observations, self.q_bias_pairs = normalise_observations, q_bias_pairs
         updates = schedule.updates_per_collect
         for group in spec.groups:
@@ -207,7 +213,9 @@ class Trainer:
 
         def one(policy, env, key):
             length, kept = self.schedule.rollout_length, self.q_bias_pairs > 0
-            return rollout.collect(self.env, self.spec, policy, env, key, length, random=random, keep_states=kept)
+            return rollout.collect(
+                self.env, self.spec, policy, env, key, length, random=random, keep_states=kept, unroll=self.unroll_steps
+            )
 
         keys = jax.vmap(partial(jax.random.split, num=2))(state.key)
         env, rows, episodes, states = jax.vmap(one)(self.policy(state, hyper), state.env, keys[:, 0])
@@ -258,7 +266,7 @@ class Trainer:
             if keys.shape[0] == 1:
                 states, metrics = stretch(seed, hyper, states, keys[0])
             else:
-                states, metrics = jax.lax.scan(partial(stretch, seed, hyper), states, keys)
+                states, metrics = jax.lax.scan(partial(stretch, seed, hyper), states, keys, unroll=self.unroll)
             return states, jax.tree.map(lambda m: m.reshape(-1, m.shape[-1]), metrics)
 
         keys = jax.vmap(partial(jax.random.split, num=2))(state.key)
@@ -305,7 +313,7 @@ class Trainer:
         """`cycle`(state, hyper) -> (state, output) of the local seeds, repeated `cycles` times in one `lax.scan`."""
 
         def repeat(state, hyper):
-            state, outputs = jax.lax.scan(lambda s, _: cycle(s, hyper), state, length=cycles)
+            state, outputs = jax.lax.scan(lambda s, _: cycle(s, hyper), state, length=cycles, unroll=self.unroll)
             return state, jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), outputs)
 
         specs = (self._specs, P("seeds"))
