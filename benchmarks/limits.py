@@ -78,7 +78,7 @@ def products(trainer: Trainer) -> dict[Product, float]:
     """How many of each product one device does in one cycle."""
     schedule, spec = trainer.schedule, trainer.spec
     found: dict[Product, float] = {}
-    local = trainer.rows // trainer.mesh.size
+    local = trainer.local_seeds
     updates = trainer.cycle_collects * schedule.updates_per_collect
     for group in spec.groups:
         together = trainer.piece * (1 if trainer.on_cpu else len(group.members))
@@ -94,7 +94,8 @@ def products(trainer: Trainer) -> dict[Product, float]:
 
 def _update(trainer: Trainer, group: Group) -> Iterator[tuple[Product, float]]:
     """(product, how many an update) of one agent of the group: see `learner._update_agent`."""
-    spec, algorithm, batch = trainer.spec, group.algorithm, trainer.schedule.batch_size
+    spec, algorithm = trainer.spec, group.algorithm
+    batch = trainer.schedule.batch_size // trainer.devices_per_seed
     hidden, delay = algorithm.hidden, algorithm.policy_delay
     central = algorithm.critic == "central"
     # With one minibatch for all, the members of a group share their target actions.

@@ -236,7 +236,7 @@ def test_minibatches(monkeypatch, shared):
     """The first update comes with exactly `learning_starts` transitions, which can all be drawn, the newest too; later
     updates see all that the ring holds; nobody draws an empty row. 4,000 draws miss one of 60 rows once in 10^27."""
     schedule = dataclasses.replace(SCHEDULE, batch_size=4000, shared_minibatch=shared)
-    trainer = make([0], schedule, delays=(1, 1))
+    trainer = make([0], schedule, delays=(1, 1), devices_per_seed=1)
     _, metrics, log = stubbed_run(monkeypatch, trainer, back(main_run()[1][0], slice(0, 1)), cycles=4)
     assert {shape[:2] for shape in log} == {(1 if shared else 2, 4000)}
     np.testing.assert_array_equal(metrics.update.critic_loss[0, :, 0], [36, 48, 60, 60])
@@ -284,6 +284,28 @@ def test_devices_and_pieces_and_chunks_and_unrolling():
     short = jax.tree.map(lambda *m: np.concatenate(m, axis=1)[:3], *metrics)
     # float32 as in `same`; returns are sums of some hundred.
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), plain(long), short)
+
+
+def test_devices_that_share_a_seed():
+    """One seed on two devices, half of each minibatch on each: as beside others on one, and the same on both devices."""
+    trainer = make([1], dataclasses.replace(SCHEDULE, batch_size=6), tau=1.0)
+    assert (
+        make([0, 1, 2]).devices_per_seed == 1
+        and make([1], dataclasses.replace(SCHEDULE, batch_size=5)).devices_per_seed == 1
+    )
+    assert trainer.devices_per_seed == trainer.mesh.size == 2 and trainer.device_seeds()[1][1] == [0]
+    alone = make([1], trainer.schedule, tau=1.0, devices_per_seed=1)
+    ends = []
+    for t in (trainer, alone):
+        state, m = t.chunk(3)(t.prefill(t.init(jax.vmap(jax.random.key)(jnp.array([1]))))[0])
+        ends.append((state, plain(state), plain(m)))
+    same(ends[0][1], ends[1][1], slice(None), slice(None))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), ends[0][2], ends[1][2])
+    for leaf in jax.tree.leaves(ends[0][0].groups):
+        one, other = (np.asarray(shard.data) for shard in leaf.addressable_shards)
+        np.testing.assert_array_equal(one, other)
+    with pytest.raises(ValueError, match="2 of 2 devices cannot share 5 rows"):
+        make([1], dataclasses.replace(SCHEDULE, batch_size=5), devices_per_seed=2)
 
 
 def test_evaluate():

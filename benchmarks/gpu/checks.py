@@ -78,7 +78,7 @@ def replay_copies() -> int:
     shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.spec.row_size)
     state = state._replace(replay=jax.ShapeDtypeStruct(shape, jnp.float32))
     text = trainer.chunk(3).jitted.lower(state, trainer.hyper).compile().as_text()
-    local = f"{shape[0] // trainer.mesh.size},{shape[1]},{shape[2]}"
+    local = f"{trainer.local_seeds},{shape[1]},{shape[2]}"
     return len(re.findall(rf"f32\[{local}\]\S* copy(-start)?\(", text))
 
 

@@ -115,6 +115,8 @@ def _replay_rows(trainer: Trainer, state: TrainState):
     """(seed number, its filled rows) one after the other."""
     filled = trainer.filled_rows(int(state.collects))
     for shard in state.replay.addressable_shards:
+        if shard.replica_id:
+            continue  # a copy on another device that works on the same seeds
         first = shard.index[0].start or 0
         for place in range(shard.data.shape[0]):
             if first + place < trainer.num_seeds:

@@ -10,6 +10,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import optax
+from jax.flatten_util import ravel_pytree
 
 from matd3_jax import networks, optimiser
 from matd3_jax.algorithms import HyperParams
@@ -121,6 +122,7 @@ def update(
     move: Sequence[bool],
     sequential: bool = False,
     one_by_one: bool = False,
+    axis: str | None = None,
 ) -> tuple[tuple[GroupState, ...], UpdateMetrics]:
     """One update of every agent's critics, and of actors and targets where `move` says so.
 
@@ -133,16 +135,18 @@ def update(
             learning from the same state.
         one_by_one: compute the agents of a group one after another instead of in one batch: the same numbers, while
             one agent's activations stay in a CPU's cache.
+        axis: mesh axis whose devices share the work of each minibatch: `rows` are this device's equal part of it (the
+            first rows on the first device), gradients are averaged over all. None: one device has the whole.
     """
     mu_targets = [group.actor_target for group in state]
     keys = jax.random.split(key, len(spec.groups))
     batches = [_minibatches(spec, group, rows, h.gamma) for group, h in zip(spec.groups, hyper, strict=True)]
-    noises = [_noise(spec, group, rows.shape[:2], k) for group, k in zip(spec.groups, keys, strict=True)]
+    noises = [_noise(spec, group, rows.shape[:2], k, axis) for group, k in zip(spec.groups, keys, strict=True)]
     new, metrics = list(state), jnp.full((3, spec.num_agents), jnp.nan)
 
     def member(g: int, targets: Sequence[chex.ArrayTree], next_action: chex.Array | None = None):
         def f(args):
-            return _update_agent(spec, spec.groups[g], hyper[g], move[g], targets, *args, next_action)
+            return _update_agent(spec, spec.groups[g], hyper[g], move[g], axis, targets, *args, next_action)
 
         return f
 
@@ -174,6 +178,7 @@ def _update_agent(
     group: Group,
     hyper: HyperParams,
     move: bool,
+    axis: str | None,
     mu_targets: Sequence[chex.ArrayTree],
     state: GroupState,
     own_target: chex.ArrayTree,
@@ -200,7 +205,7 @@ def _update_agent(
         loss = jnp.mean(jnp.square(q - y), axis=-1)
         return loss.sum(), (loss.mean(), q[0].mean())
 
-    gradients, (loss, q_value) = jax.grad(critic_loss, has_aux=True)(state.critic)
+    gradients, (loss, q_value) = _mean_over(axis, jax.grad(critic_loss, has_aux=True)(state.critic))
     q_params, q_optimiser = optimiser.apply(
         algorithm, state.critic, state.critic_optimiser, gradients, hyper.critic_lr, hyper.max_grad_norm, stack_ndim=1
     )
@@ -219,7 +224,7 @@ def _update_agent(
         loss = -q1.mean() + hyper.logit_regulariser * jnp.mean(jnp.square(output))
         return loss, loss
 
-    gradients, mu_loss = jax.grad(actor_loss, has_aux=True)(state.actor)
+    gradients, mu_loss = _mean_over(axis, jax.grad(actor_loss, has_aux=True)(state.actor))
     mu_params, mu_optimiser = optimiser.apply(
         algorithm, state.actor, state.actor_optimiser, gradients, hyper.actor_lr, hyper.max_grad_norm, stack_ndim=0
     )
@@ -231,6 +236,14 @@ def _update_agent(
         critic_target=optax.incremental_update(q_params, state.critic_target, hyper.tau),
     )
     return state, (loss, q_value, mu_loss)
+
+
+def _mean_over(axis: str | None, tree: chex.ArrayTree) -> chex.ArrayTree:
+    """Means over the devices of the axis, as one vector: each array by itself costs a meeting of all devices."""
+    if axis is None:
+        return tree
+    flat, restored = ravel_pytree(tree)
+    return restored(jax.lax.pmean(flat, axis))
 
 
 def _target_actions(
@@ -286,9 +299,11 @@ def _minibatches(spec: Spec, group: Group, rows: chex.Array, gamma: chex.Array |
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(one(i) for i in group.members))
 
 
-def _noise(spec: Spec, group: Group, shape: tuple[int, int], key: chex.PRNGKey) -> Noise:
-    """The random numbers of a group's members; `shape`: minibatches (1: shared) and their size."""
-    batches, size = shape
+def _noise(spec: Spec, group: Group, shape: tuple[int, int], key: chex.PRNGKey, axis: str | None) -> Noise:
+    """The random numbers of a group's members; `shape`: minibatches (1: shared) and their size, on each device of
+    `axis` (which draws those of the whole minibatch, as one device would, and takes its own)."""
+    batches, local = shape
+    size = local * (1 if axis is None else jax.lax.axis_size(axis))
     members = len(group.members)
     action_key, target_key, smooth_key = jax.random.split(key, 3)
     wanted: list[tuple[ActionSpace, tuple[int, ...]]]
@@ -308,8 +323,17 @@ def _noise(spec: Spec, group: Group, shape: tuple[int, int], key: chex.PRNGKey) 
     def normal(key, space, lead):
         return networks.flat_draw(jax.random.normal, key, (*lead, space.size)) if group.algorithm.smoothing else None
 
-    return Noise(
+    noise = Noise(
         target=draws(networks.policy_noise, target_key),
         smoothing=draws(normal, smooth_key),
         action=networks.policy_noise(action_key, group.action_space, (members, size)),
     )
+    return jax.tree.map(lambda draw: own_part(draw, axis, dimension=-2), noise)
+
+
+def own_part(whole: chex.Array, axis: str | None, dimension: int) -> chex.Array:
+    """This device's equal part of an array along `dimension`, one of as many as the mesh axis has devices."""
+    if axis is None:
+        return whole
+    size = whole.shape[dimension] // jax.lax.axis_size(axis)
+    return jax.lax.dynamic_slice_in_dim(whole, jax.lax.axis_index(axis) * size, size, dimension)

@@ -7,7 +7,7 @@ import jax
 
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError
-from matd3_jax.trainer import Trainer
+from matd3_jax.trainer import Trainer, idle_devices
 from matd3_jax.training import Training
 
 PROCESS = 1_300_000_000
@@ -20,12 +20,15 @@ def needed(trainer: Trainer, seeds: int) -> int:
     Args:
         trainer: of any number of seeds; its schedule, environment and algorithms count.
     """
-    devices = min(seeds, len(jax.devices()))
-    rows = math.ceil(seeds / devices) * devices
-    replay = trainer.replay_bytes // trainer.rows
-    together = devices if trainer.on_cpu else rows  # seeds updated at the same time
+    devices = len(jax.devices())
+    each = idle_devices(devices, seeds, trainer.schedule.batch_size) if trainer.on_cpu else 1
+    places = min(seeds, devices // each)
+    rows = math.ceil(seeds / places) * places
+    copies = each * rows  # a seed's state is on all the devices that work on it
+    replay = trainer.replay_bytes // (trainer.rows * trainer.devices_per_seed)
+    together = places if trainer.on_cpu else rows  # seeds updated at the same time
     # A checkpoint is written seed by seed: one seed's replay on its way out, and once more in the writer's hands.
-    return PROCESS + rows * (replay + seed_bytes(trainer)) + together * update_bytes(trainer) + 2 * replay
+    return PROCESS + copies * (replay + seed_bytes(trainer)) + together * update_bytes(trainer) + 2 * replay
 
 
 def seed_bytes(trainer: Trainer) -> int:

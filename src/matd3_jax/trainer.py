@@ -48,13 +48,22 @@ class Metrics(NamedTuple):
     """Means over the updates of the cycle (actor_loss over those that moved the actor)."""
 
 
+def idle_devices(devices: int, seeds: int, batch_size: int) -> int:
+    """How many devices each seed can have where there are fewer seeds than devices: as many as there are for it and
+    divide the minibatch; 1 where there are not."""
+    return max(n for n in range(1, max(1, devices // seeds) + 1) if batch_size % n == 0)
+
+
 class Trainer:
     """Programs that start and advance the training of `num_seeds` seeds.
 
     Args:
         spec: agents and algorithms of `env`.
         hyper: for each team its `HyperParams`, every leaf a number or an array [seeds].
-        devices: where the seeds are spread out; default all devices, at most one a seed.
+        devices: where the seeds are spread out; default all devices.
+        devices_per_seed: how many of the devices share the work of one seed, each with an equal part of every
+            minibatch (the networks are the same on all, and so is the replay). Default on CPU: as many as would have
+            no seed otherwise and divide the minibatch; elsewhere 1.
         piece: how many of a device's seeds are updated together; default 1 on CPU (a seed's batch stays in cache) and
             all of them elsewhere.
         normalise_observations: networks see observations in units of their running mean and standard deviation; the
@@ -79,6 +88,7 @@ class Trainer:
         q_bias_pairs: int = 0,
         unroll: int = 1,
         unroll_steps: int = 1,
+        devices_per_seed: int | None = None,
     ):
         self.env, self.spec, self.schedule, self.num_seeds = env, spec, schedule, num_seeds
         self.unroll, self.unroll_steps = unroll, unroll_steps
@@ -88,12 +98,21 @@ class Trainer:
             delay = group.algorithm.policy_delay
             if updates % delay and delay % updates:
                 raise ValueError(f"updates_per_collect={updates} and policy_delay={delay}: one must divide the other")
-        devices = list(jax.devices() if devices is None else devices)[:num_seeds]
-        self.mesh = Mesh(np.array(devices), ("seeds",))
-        self.rows = math.ceil(num_seeds / len(devices)) * len(devices)
-        """Seeds actually run: `num_seeds` filled up to a multiple of the devices with copies of the last one."""
+        devices = list(jax.devices() if devices is None else devices)
         self.on_cpu = devices[0].platform == "cpu"
-        self.piece = piece or (1 if self.on_cpu else self.rows // len(devices))
+        if devices_per_seed is None:
+            devices_per_seed = idle_devices(len(devices), num_seeds, schedule.batch_size) if self.on_cpu else 1
+        if schedule.batch_size % devices_per_seed or devices_per_seed > len(devices):
+            raise ValueError(f"{devices_per_seed} of {len(devices)} devices cannot share {schedule.batch_size} rows")
+        self.devices_per_seed = devices_per_seed
+        places = min(len(devices) // devices_per_seed, num_seeds)
+        grid = np.array(devices[: places * devices_per_seed]).reshape(places, devices_per_seed)
+        self.mesh = Mesh(grid, ("seeds", "minibatch"))
+        self.local_seeds = math.ceil(num_seeds / places)
+        """Seeds on each device."""
+        self.rows = self.local_seeds * places
+        """Seeds actually run: `num_seeds` filled up to a multiple of the mesh with copies of the last one."""
+        self.piece = piece or (1 if self.on_cpu else self.local_seeds)
         per_group = [hyper[spec.teams[group.members[0]]] for group in spec.groups]
         spread = [
             jax.tree.map(lambda h: jnp.broadcast_to(jnp.asarray(h, jnp.float32), num_seeds), h) for h in per_group
@@ -130,8 +149,8 @@ class Trainer:
 
     @property
     def replay_bytes(self) -> int:
-        """Memory of the replay of all seeds."""
-        return 4 * self.rows * self.schedule.replay_capacity * self.spec.row_size
+        """Memory of the replay of all seeds, on all devices that have it."""
+        return 4 * self.devices_per_seed * self.rows * self.schedule.replay_capacity * self.spec.row_size
 
     def filled_rows(self, collects: int) -> int:
         """Transitions in each seed's replay after `collects` collects."""
@@ -146,9 +165,9 @@ class Trainer:
 
     def device_seeds(self) -> list[tuple[jax.Device, list[int]]]:
         """Each device with the numbers of the seeds it runs (copies bear the last seed's number)."""
-        share = self.rows // self.mesh.size
         numbers = [min(seed, self.num_seeds - 1) for seed in range(self.rows)]
-        return [(d, numbers[i * share : (i + 1) * share]) for i, d in enumerate(self.mesh.devices.flat)]
+        shares = [numbers[i : i + self.local_seeds] for i in range(0, self.rows, self.local_seeds)]
+        return [(d, share) for row, share in zip(self.mesh.devices, shares, strict=True) for d in row]
 
     @property
     def shardings(self) -> TrainState:
@@ -246,16 +265,17 @@ class Trainer:
         size = replay.filled(schedule.replay_capacity, schedule.collect_steps, state.collects)
         batches = 1 if schedule.shared_minibatch else self.spec.num_agents
         unrolled = math.gcd(self.period, schedule.updates_per_collect)
+        axis = "minibatch" if self.devices_per_seed > 1 else None
 
         def stretch(seed, hyper, carry, keys):
             states, metrics = carry, []
             for u in range(unrolled):
                 index_key, update_key = jax.random.split(keys[u])
                 indices = replay.sample_indices(index_key, size, (batches, schedule.batch_size))
-                rows = self.minibatches(state, hyper, seed, indices)
+                rows = self.minibatches(state, hyper, seed, learner.own_part(indices, axis, dimension=-1))
                 move = [(first + u + 1) % group.algorithm.policy_delay == 0 for group in groups]
                 states, m = learner.update(
-                    self.spec, states, hyper, rows, update_key, move, schedule.sequential, one_by_one=self.on_cpu
+                    self.spec, states, hyper, rows, update_key, move, schedule.sequential, self.on_cpu, axis
                 )
                 metrics.append(m)
             return states, jax.tree.map(lambda *m: jnp.stack(m), *metrics)

@@ -107,8 +107,9 @@ class Training:
     def memory(self) -> str:
         """The arithmetic of the replay's memory."""
         t, s = self.trainer, self.spec
+        copies = f"{t.devices_per_seed} copies x " if t.devices_per_seed > 1 else ""
         return (
-            f"replay: {t.rows} seeds x {t.schedule.replay_capacity:,} transitions x {s.row_size} numbers x 4 bytes "
+            f"replay: {t.rows} seeds x {copies}{t.schedule.replay_capacity:,} transitions x {s.row_size} numbers x 4 bytes "
             f"= {t.replay_bytes / 1e9:.2f} GB (x {s.observation_size}, actions {s.action_size}, "
             f"rewards {s.num_agents}, {'more 1, ' if s.n_step > 1 else ''}x' {s.observation_size}, discount 1)"
         )
@@ -119,7 +120,7 @@ class Training:
         if self.trainer.replay_bytes > free:
             raise UserError(
                 f"{self.memory}, but only {free / 1e9:.2f} GB are free: fewer seeds, or replay_capacity at most "
-                f"{int(free / (4 * self.trainer.rows * self.spec.row_size)):,}"
+                f"{int(free * self.trainer.schedule.replay_capacity / self.trainer.replay_bytes):,}"
             )
 
     # ---- running -----------------------------------------------------------------------------------------------------
