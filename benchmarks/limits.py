@@ -11,6 +11,7 @@ ReLU, no random numbers, no sampling, no optimiser, no environment.
 """
 
 import dataclasses
+import functools
 import json
 import math
 import re
@@ -24,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import throughput
+from benchmarks.commit import commit
 from matd3_jax import command, config, devices, learner, memory
 from matd3_jax.spec import Group
 from matd3_jax.trainer import Trainer
@@ -74,8 +75,8 @@ class Floor:
 # ---- counted by hand -------------------------------------------------------------------------------------------------
 
 
-def products(trainer: Trainer) -> dict[Product, float]:
-    """How many of each product one device does in one cycle."""
+def products(trainer: Trainer, part: str = "loop") -> dict[Product, float]:
+    """How many of each product one device does in one cycle: of the "rollout", the "update", or the whole "loop"."""
     schedule, spec = trainer.schedule, trainer.spec
     found: dict[Product, float] = {}
     local = trainer.local_seeds
@@ -83,12 +84,13 @@ def products(trainer: Trainer) -> dict[Product, float]:
     for group in spec.groups:
         together = trainer.piece * (1 if trainer.on_cpu else len(group.members))
         times = local * len(group.members) / together * updates
-        for part, share in _update(trainer, group):
-            batched = _batched(part, together)
+        for product, share in _update(trainer, group) if part != "rollout" else ():
+            batched = _batched(product, together)
             found[batched] = found.get(batched, 0) + times * share
         sizes = (group.observation_size, *group.algorithm.hidden, group.action_space.size)
-        for part in _forward((local, len(group.members)), schedule.num_envs, sizes):
-            found[part] = found.get(part, 0) + trainer.cycle_collects * schedule.rollout_length
+        acting = _forward((local, len(group.members)), schedule.num_envs, sizes) if part != "update" else []
+        for product in acting:
+            found[product] = found.get(product, 0) + trainer.cycle_collects * schedule.rollout_length
     return found
 
 
@@ -154,14 +156,15 @@ def _batched(product: Product, together: int) -> Product:
     return Product(f"n{left},n{right}->n{out}", (together, *product.left), (together, *product.right))
 
 
-def least_bytes(trainer: Trainer) -> int:
+def least_bytes(trainer: Trainer, part: str = "loop") -> int:
     """Bytes of one cycle, all seeds, that cannot stay in a cache: minibatches read from the replay, new rows written,
     networks and optimisers read and written once an update (twice for what is moved along)."""
     schedule, spec = trainer.schedule, trainer.spec
     batches = 1 if schedule.shared_minibatch else spec.num_agents
-    rows = 4 * spec.row_size * (batches * schedule.batch_size * schedule.updates_per_collect + schedule.collect_steps)
     state = memory.size(trainer.abstract_state().groups) // trainer.rows
-    return trainer.rows * trainer.cycle_collects * (rows + 2 * state * schedule.updates_per_collect)
+    written = 4 * spec.row_size * schedule.collect_steps
+    read = schedule.updates_per_collect * (4 * spec.row_size * batches * schedule.batch_size + 2 * state)
+    return trainer.rows * trainer.cycle_collects * {"rollout": written, "update": read, "loop": written + read}[part]
 
 
 # ---- counted in the compiled program ---------------------------------------------------------------------------------
@@ -227,6 +230,7 @@ def compiled_flops(trainer: Trainer) -> float:
 # ---- measured --------------------------------------------------------------------------------------------------------
 
 
+@functools.cache
 def seconds(product: Product, count: int, repeats: int = 5) -> float:
     """Seconds of one product on each of `count` devices at the same time, median. Operands come one after the other
     from a set of eight, so that they are no warmer in cache than what the loop has just computed."""
@@ -252,6 +256,7 @@ def seconds(product: Product, count: int, repeats: int = 5) -> float:
     return _median(lambda: program(left, right), repeats) / (rounds * sets)
 
 
+@functools.cache
 def bandwidth(repeats: int = 5, mebibytes: int = 256) -> float:
     """Bytes a second that all devices together read and write (x + 1 over an array far larger than any cache)."""
     mesh = jax.sharding.Mesh(np.array(jax.devices()), ("devices",))
@@ -273,11 +278,11 @@ def _median(call: Callable[[], Any], repeats: int) -> float:
     return float(np.median(times))
 
 
-def floor(trainer: Trainer, repeats: int = 5) -> tuple[Floor, list[dict[str, Any]]]:
-    """The floor of one cycle, and a row for every kind of product: its share and its rates."""
+def floor(trainer: Trainer, repeats: int = 5, part: str = "loop") -> tuple[Floor, list[dict[str, Any]]]:
+    """The floor of one cycle, or of a part of it (see `products`), and a row for every kind of product."""
     devices_used = trainer.mesh.size
     rows = []
-    for product, count in products(trainer).items():
+    for product, count in products(trainer, part).items():
         alone = seconds(product, 1, repeats)
         together = seconds(product, devices_used, repeats) if devices_used > 1 else alone
         rows.append({
@@ -286,7 +291,7 @@ def floor(trainer: Trainer, repeats: int = 5) -> tuple[Floor, list[dict[str, Any
         })  # fmt: skip
     flops = devices_used * sum(row["count"] * row["flops"] for row in rows)
     alone, together = (sum(row["count"] * row[f"seconds_{how}"] for row in rows) for how in ("alone", "together"))
-    return Floor(alone, together, least_bytes(trainer) / bandwidth(repeats), flops), rows
+    return Floor(alone, together, least_bytes(trainer, part) / bandwidth(repeats), flops), rows
 
 
 def main(argv: Sequence[str]) -> int:
@@ -296,7 +301,7 @@ def main(argv: Sequence[str]) -> int:
     settings = config.load([f"seeds={options['seeds']}", "total_steps=100000", "eval_every=0", *overrides])
     trainer = Training(settings).trainer
     report: dict[str, Any] = {"machine": devices.description(), "versions": devices.versions()}
-    report |= {"commit": throughput.commit(), "settings": list(argv)}
+    report |= {"commit": commit(), "settings": list(argv)}
     found, rows = floor(trainer, options["repeats"])
     for row in sorted(rows, key=lambda row: -row["count"] * row["seconds_alone"]):
         shapes = f"{row['equation']:<14} {list(row['left'])} {list(row['right'])}"

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import throughput
+from benchmarks.commit import commit
 from matd3_jax import command, config, devices
 from matd3_jax.errors import UserError
 
@@ -40,7 +41,7 @@ def main(argv: Sequence[str]) -> int:
     report: dict[str, Any] = {
         "machine": devices.description(),
         "versions": devices.versions(),
-        "commit": throughput.commit(),
+        "commit": commit(),
         "settings": list(argv),
         "gflops": throughput.matmul_gflops(),
         "rows": [],

@@ -8,11 +8,12 @@ Other keys are settings of the run, as `python -m matd3_jax.train` takes them. E
 and is the median of `repeats` stretches of about a second, with the slowest and the fastest beside it. Parts:
 "environment" steps the environments with the same action again and again, "rollout" adds the policies and the write
 into the replay, "replay" gathers the minibatches, "update" is all that learning does, gathering included. The env
-steps/s of a part are those of a loop in which everything else is free.
+steps/s of a part are those of a loop in which everything else is free. The floor is the time that the matrix products
+of a part alone take on these devices, measured in the same run (`benchmarks.limits`): "of floor" is the share of a
+part's time that this would be.
 """
 
 import json
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -23,6 +24,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks import limits
+from benchmarks.commit import commit
 from matd3_jax import command, config, devices, networks, replay
 from matd3_jax.errors import UserError
 from matd3_jax.trainer import Trainer, TrainState
@@ -47,15 +50,14 @@ def main(argv: Sequence[str]) -> int:
     report["gflops_before"] = matmul_gflops()
     for key in ("machine", "versions", "commit", "gflops_before"):
         print(f"{key}: {report[key]}")
-    print(
-        f"{'seeds':>5} {'part':<12} {'env steps/s':>12} {'slowest':>10} {'fastest':>10} {'updates/s':>10}", flush=True
-    )
+    print(f"{'seeds':>5} {'part':<12} {'env steps/s':>12} {'slowest':>10} {'fastest':>10} {'updates/s':>10} "
+          f"{'of floor':>9}", flush=True)  # fmt: skip
     rows = []
     for seeds in counts:
         for row in measure(overrides, seeds, options["repeats"], options["seconds"]):
             rows.append(row)
             print(f"{row['seeds']:>5} {row['part']:<12} {row['env_steps_per_second']:>12,.0f} {row['slowest']:>10,.0f} "
-                  f"{row['fastest']:>10,.0f} {row['updates_per_second']:>10,.1f}"
+                  f"{row['fastest']:>10,.0f} {row['updates_per_second']:>10,.1f} {row['of_floor']:>9.1%}"
                   f"   compiled in {row['compile_seconds']:.1f} s", flush=True)  # fmt: skip
     report["rows"] = rows
     report["gflops_after"] = matmul_gflops()
@@ -103,6 +105,7 @@ def measure(
             jax.block_until_ready(state)
             times.append((time.perf_counter() - begun) / calls)
         cycles = program.cycles
+        least = limits.floor(trainer, part=part)[0].seconds if part in ("rollout", "update", "loop") else 0.0
         steps = seeds * cycles * trainer.cycle_steps
         updates = seeds * cycles * trainer.cycle_collects * trainer.schedule.updates_per_collect
         rows.append(
@@ -113,6 +116,7 @@ def measure(
                 "slowest": steps / max(times),
                 "fastest": steps / min(times),
                 "updates_per_second": updates / float(np.median(times)) if part in ("update", "loop") else 0.0,
+                "of_floor": least * cycles / float(np.median(times)),
                 "compile_seconds": compile_seconds,
             }
         )
@@ -197,19 +201,6 @@ def _updates(trainer: Trainer, state: TrainState, hyper: Any) -> tuple[TrainStat
     for c in range(trainer.cycle_collects):
         state, metrics = trainer.learn(state, hyper, first=c * trainer.schedule.updates_per_collect)
     return state, metrics
-
-
-def commit() -> str:
-    """The git commit of the project, marked where files differ from it."""
-    here = Path(__file__).parent
-
-    def git(*words: str) -> str:
-        return subprocess.run(["git", *words], cwd=here, capture_output=True, text=True, check=True).stdout.strip()
-
-    try:
-        return git("rev-parse", "--short", "HEAD") + (" with changes" if git("status", "--porcelain", "-uno") else "")
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
 
 
 if __name__ == "__main__":

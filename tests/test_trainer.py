@@ -287,7 +287,7 @@ def test_devices_and_pieces_and_chunks_and_unrolling():
 
 
 def test_devices_that_share_a_seed():
-    """One seed on two devices, half of each minibatch on each: as beside others on one, and the same on both devices."""
+    """One seed on two devices, half of each minibatch on each: as on one, and the same on both devices."""
     trainer = make([1], dataclasses.replace(SCHEDULE, batch_size=6), tau=1.0)
     assert (
         make([0, 1, 2]).devices_per_seed == 1

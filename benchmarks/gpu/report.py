@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benchmarks import throughput
+from benchmarks.commit import commit
 from matd3_jax import devices
 from matd3_jax.errors import UserError
 
@@ -28,7 +28,7 @@ class Report:
         out.mkdir(parents=True, exist_ok=True)
         self.out, self.file = out, out / "report.json"
         self.end = time.monotonic() + 60 * minutes
-        facts = {"machine": devices.description(), "versions": devices.versions(), "commit": throughput.commit()}
+        facts = {"machine": devices.description(), "versions": devices.versions(), "commit": commit()}
         before = json.loads(self.file.read_text()) if self.file.exists() else {}
         self.facts: Row = facts
         self.parts: dict[str, dict[str, Row]] = before.get("parts", {})
