@@ -22,6 +22,7 @@ from benchmarks import throughput
 from experiments import cooperative_navigation
 from matd3_jax import command, config, devices, learner
 from matd3_jax.errors import UserError
+from matd3_jax.trainer import Trainer
 from matd3_jax.training import Training
 
 ROW_BYTES = 127 * 4
@@ -81,7 +82,12 @@ def replay_copies() -> int:
     state = trainer.abstract_state()
     shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.spec.row_size)
     state = state._replace(replay=jax.ShapeDtypeStruct(shape, jnp.float32))
-    text = trainer.chunk(3).jitted.lower(state, trainer.hyper).compile().as_text()
+    return copies_in(trainer.chunk(3).jitted.lower(state, trainer.hyper).compile().as_text(), trainer)
+
+
+def copies_in(text: str, trainer: Trainer) -> int:
+    """Copies of a device's whole replay in the text of an optimised program."""
+    shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.spec.row_size)
     local = f"{shape[0] // trainer.mesh.size},{shape[1]},{shape[2]}"
     return len(re.findall(rf"= f32\[{local}\]\S* copy\(", text))
 
