@@ -3,8 +3,8 @@
 The programs of `python -m matd3_jax.train` with these settings, in the order in which it needs them: start (networks,
 environments and an empty replay, run once), prefill, evaluation, chunk. Of each: seconds to trace it, to lower it to
 XLA's input, and to compile it or to read it from the compilation cache; "cpu" is the processor time of all three. The
-replay's size, which does not change the work, is that of `learning_starts`; nothing is trained. `benchmarks.compile_times`
-calls this once for each environment and state of the cache.
+replay has `learning_starts` rows, their number does not change the work; nothing is trained.
+`benchmarks.compile_times` calls this once for each environment and state of the cache.
 """
 
 import json
@@ -39,9 +39,9 @@ def main(argv: Sequence[str]) -> int:
     trainer = training.trainer
     found = dict.fromkeys(EVENTS.values(), 0.0)
 
-    def listen(event: str, seconds: float, **_: Any) -> None:
+    def listen(event: str, duration_secs: float, **_: Any) -> None:
         if event in EVENTS:
-            found[EVENTS[event]] += seconds
+            found[EVENTS[event]] += duration_secs
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     state = jax.block_until_ready(trainer.init(training.keys()))

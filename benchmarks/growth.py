@@ -7,9 +7,9 @@
 simple_spread, each axis alone (an empty list leaves it out); the others stay at the paper's settings with `few_seeds`
 seeds and a replay of 25,600 transitions, where learning starts in the paper. Replays are full. Other keys are settings
 of the run. Each point is a process of its own (`benchmarks.loop`): time of a cycle of all seeds (200 env steps of each
-and, for MATD3, two updates), median of `repeats` stretches of `seconds`; memory as XLA counts it for the compiled chunk,
-and at most of the whole process. The exponent k of time ~ value^k is a least-squares line through the logarithms: over
-all points, and over the upper half of them. A figure is drawn beside `out`.
+and, for MATD3, two updates), median of `repeats` stretches of `seconds`; memory as XLA counts it for the compiled
+chunk, and at most of the whole process. The exponent k of time ~ value^k is the slope of a least-squares line through
+the logarithms: over all points, and over the upper half of them. A figure is drawn beside `out`.
 """
 
 import json
@@ -54,9 +54,10 @@ def main(argv: Sequence[str]) -> int:
         "beside": {"seeds": options["few_seeds"], **BASE},
     }
     print(f"commit {report['commit']}; beside each axis {report['beside']}")
-    print(f"{'axis':<7} {'value':>9} {'ms a cycle':>11} {'env steps/s':>12} {'GFLOP':>8} {'XLA, MB':>9} {'of it replay':>12} "
-          f"{'temporaries':>11} {'process':>8} {'compiled in':>11}", flush=True)  # fmt: skip
-    report["axes"] = axes = {}
+    print(f"{'axis':<7} {'value':>9} {'ms a cycle':>11} {'env steps/s':>12} {'GFLOP':>8} {'XLA, MB':>9} "
+          f"{'of it replay':>12} {'temporaries':>11} {'process':>8} {'compiled in':>11}", flush=True)  # fmt: skip
+    axes: dict[str, list[dict[str, Any]]] = {}
+    report["axes"] = axes
     measured: dict[tuple, dict[str, Any]] = {}
     for axis in AXES:
         for value in options[axis]:
@@ -83,7 +84,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def settings(point: Mapping[str, int]) -> list[str]:
-    """Settings of the run at a point: {"seeds", "agents", "replay", "batch"}. The replay is full when learning starts."""
+    """Settings of a run at a point {"seeds", "agents", "replay", "batch"}: the replay is full when learning starts."""
     return [
         "env=simple_spread",
         f"env.num_agents={point['agents']}",
@@ -131,9 +132,10 @@ def _show(axis: str, point: Mapping[str, Any]) -> None:
         print(f"{axis:<7} {point['value']:>9,} {point['error']}", flush=True)
         return
     mb = {name: value / 1e6 for name, value in point["memory"].items()}
-    print(f"{axis:<7} {point['value']:>9,} {1000 * point['cycle_seconds']:>11,.1f} {point['env_steps_per_second']:>12,.0f} "
-          f"{point['product_flops_of_a_cycle'] / 1e9:>8.2f} {mb['xla']:>9,.0f} {mb['replay']:>12,.0f} "
-          f"{mb['temporaries']:>11,.0f} {mb['process']:>8,.0f} {point['compile_seconds']:>9.1f} s", flush=True)  # fmt: skip
+    print(f"{axis:<7} {point['value']:>9,} {1000 * point['cycle_seconds']:>11,.1f} "
+          f"{point['env_steps_per_second']:>12,.0f} {point['product_flops_of_a_cycle'] / 1e9:>8.2f} "
+          f"{mb['xla']:>9,.0f} {mb['replay']:>12,.0f} {mb['temporaries']:>11,.0f} {mb['process']:>8,.0f} "
+          f"{point['compile_seconds']:>9.1f} s", flush=True)  # fmt: skip
 
 
 def _check(options: Mapping[str, Any]) -> None:

@@ -38,7 +38,8 @@ def draw(path: Path, axes: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
             times = 1000 * np.array([[p["cycle_seconds"], p["fastest"], p["slowest"]] for p in points])
             top.fill_between(x, times[:, 1], times[:, 2], color=COLOURS[0], alpha=0.2, linewidth=0)
             flops = np.array([point["product_flops_of_a_cycle"] for point in points])
-            top.plot(x, times[0, 0] * flops / flops[0], color=COLOURS[2], linestyle=(0, (1, 1)), label="as the products")
+            expected = times[0, 0] * flops / flops[0]
+            top.plot(x, expected, color=COLOURS[2], linestyle=(0, (1, 1)), label="as the products")
             _line(top, x, times[:, 0], 0, "measured")
             for key, (colour, label) in MEMORY.items():
                 _line(bottom, x, np.array([point["memory"][key] / 1e6 for point in points]), colour, label)
@@ -68,7 +69,7 @@ def _guides(axis: Axes, x: np.ndarray, first: float, orders: Sequence[int]) -> N
     for order in orders:
         y = first * (x / x[0]) ** order
         axis.plot(x, y, color="0.6", linewidth=0.8, linestyle=(0, (5, 1.5)), zorder=1)
-        axis.annotate(NAMES[order], (x[-1], y[-1]), color="0.4", fontsize=7, ha="right", va="bottom", annotation_clip=True)
+        axis.annotate(NAMES[order], (x[-1], y[-1]), color="0.4", fontsize=7, ha="right", va="bottom")
 
 
 def _limits(row: np.ndarray, values: Sequence[Sequence[float]]) -> None:

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.loop [repeats=5] [seconds=1] [key=value ...]`: the whole loop of one setting, as a line of JSON.
+"""`python -m benchmarks.loop [repeats=5] [seconds=1] [key=value ...]`: the whole loop of one setting, as JSON.
 
 Time of a cycle, counted products, and memory: what XLA says that the compiled chunk takes, and what the process took at
 most. `learning_starts` transitions are played first, so that with learning_starts=replay_capacity the replay is full.
@@ -29,7 +29,8 @@ def main(argv: Sequence[str]) -> int:
     devices.prepare()
     options, overrides = config.take(argv, ("repeats", "seconds"))
     loop = Loop(config.load(overrides))
-    times = loop.times(int(options.get("repeats", 5)), float(options.get("seconds", 1.0)))
+    calls = loop.calls(float(options.get("seconds", 1.0)))
+    times = [loop.cycle_seconds(calls) for _ in range(int(options.get("repeats", 5)))]
     trainer = loop.trainer
     steps = trainer.num_seeds * trainer.cycle_steps
     report = {
@@ -74,11 +75,10 @@ class Loop:
         jax.block_until_ready(self.state)
         return (time.perf_counter() - begun) / (calls * CYCLES)
 
-    def times(self, repeats: int, seconds: float) -> list[float]:
-        """Seconds of a cycle, one value for each of `repeats` stretches that take about `seconds` (at least one call)."""
+    def calls(self, seconds: float) -> int:
+        """How many calls of the chunk take about `seconds`, at least one; tried, so the chunk is warm after it."""
         self.cycle_seconds(1)
-        calls = max(1, round(seconds / (CYCLES * self.cycle_seconds(1))))
-        return [self.cycle_seconds(calls) for _ in range(repeats)]
+        return max(1, round(seconds / (CYCLES * self.cycle_seconds(1))))
 
     def memory(self) -> dict[str, int]:
         """Bytes, over all devices: XLA's count for the compiled chunk (`arguments` hold the replay; what it gives out
@@ -111,8 +111,8 @@ def process_memory() -> dict[str, int]:
 def product_flops(jaxpr: Any) -> float:
     """Floating point operations of the matrix products in a traced program, two for each multiplication.
 
-    Loops count as often as they run; XLA's own count (`cost_analysis`) takes the body of a loop once. Of a condition every
-    branch counts. Raises ValueError for products in a loop of unknown length.
+    Loops count as often as they run; XLA's own count (`cost_analysis`) takes the body of a loop once. Of a condition
+    every branch counts. Raises ValueError for products in a loop of unknown length.
     """
     total = 0.0
     for equation in jaxpr.eqns:
