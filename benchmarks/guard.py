@@ -41,10 +41,11 @@ class Bound(NamedTuple):
 
 
 BOUNDS = {
-    # Eight runs on a core that up to five other programs were at all the time: medians 1.88 to 2.04 with one device or
-    # two, single turns 1.6 to 2.5. Half the speed is beyond all of that.
+    # Nine runs on a core that up to five other programs were at all the time: medians 1.88 to 2.10 with one device or
+    # two, single turns 1.2 to 2.5. Half the speed is beyond all of that.
     "loop_over_floor": Bound("time of the whole loop over that of its products at the machine's rate", 2.0),
-    # 0.013 to 0.018 in the same runs: so little that twice as much would hardly show in the loop, hence the slack.
+    # Medians of 0.013 to 0.018 in the same runs (one turn: 0.49): so little that twice as much would hardly show in the
+    # loop, hence the slack.
     "rollout_share": Bound("time of the rollouts over that of the whole loop", 2.0, 0.05),
     # Counted by the compiler, so always the same; one device or two differ by 0.05. A copy of the replay adds 1.
     "memory_over_replay": Bound("memory of the compiled chunk over that of the replay", 1.0, 0.5),
