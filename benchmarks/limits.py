@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.commit import commit
+from benchmarks.loop import product_flops
 from matd3_jax import command, config, devices, learner, memory
 from matd3_jax.spec import Group
 from matd3_jax.trainer import Trainer
@@ -216,14 +217,16 @@ def _numbers(text: str) -> list[int]:
 
 
 def compiled_flops(trainer: Trainer) -> float:
-    """`counted_flops` of one cycle of all seeds; nan on accelerators, whose products are calls into libraries."""
-    if not trainer.on_cpu:
-        return math.nan
+    """`counted_flops` of one cycle of all seeds. On accelerators, where products are calls into libraries, those of the
+    traced program."""
     state = trainer.abstract_state()
     shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.spec.row_size)
     state = state._replace(replay=jax.ShapeDtypeStruct(shape, jnp.float32))
     cycles = 2  # a loop that runs once may be unrolled
-    text = trainer.chunk(cycles).jitted.lower(state, trainer.hyper).compile().as_text()
+    traced = trainer.chunk(cycles).jitted.trace(state, trainer.hyper)
+    if not trainer.on_cpu:
+        return product_flops(traced.jaxpr.jaxpr) / cycles
+    text = traced.lower().compile().as_text()
     return counted_flops(text) / cycles * trainer.mesh.size
 
 

@@ -1,6 +1,5 @@
 """Whether the numbers are right on this device: first of all, and compared with what other programs computed."""
 
-import re
 from pathlib import Path
 
 import jax
@@ -8,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.gpu.report import Report, Row
+from benchmarks.loop import copies_in
 from matd3_jax import config, envs, learner
 from matd3_jax.training import Training
 
@@ -78,8 +78,7 @@ def replay_copies() -> int:
     shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.spec.row_size)
     state = state._replace(replay=jax.ShapeDtypeStruct(shape, jnp.float32))
     text = trainer.chunk(3).jitted.lower(state, trainer.hyper).compile().as_text()
-    local = f"{trainer.local_seeds},{shape[1]},{shape[2]}"
-    return len(re.findall(rf"f32\[{local}\]\S* copy(-start)?\(", text))
+    return copies_in(text, trainer)
 
 
 def step_error() -> Row:

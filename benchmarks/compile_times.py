@@ -1,0 +1,143 @@
+"""`python -m benchmarks.compile_times`: how long train's programs take to compile for each environment, cold and warm.
+
+    python -m benchmarks.compile_times [envs=[simple_spread,ant]] [repeats=1] [at_once=1] [out=FILE.json]
+                                       [key=value ...]
+
+Default: every environment that has settings. For each a fresh process with an empty compilation cache and another one
+with the cache that the first has filled (`benchmarks.compilation`); medians of `repeats` such pairs. `at_once`: so many
+environments side by side, each on its share of the cores alone. Other keys are settings of the run. Told are, for each
+program, wall-clock seconds (of which tracing and lowering, done in Python) and processor time, which other work on the
+machine changes less; cold programs of more than 30 s of a core are marked.
+"""
+
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from queue import Queue
+from typing import Any
+
+import numpy as np
+
+from benchmarks import fresh
+from benchmarks.throughput import commit
+from matd3_jax import command, config, devices
+from matd3_jax.envs.base import nearest
+from matd3_jax.errors import UserError
+
+DEFAULTS: dict[str, Any] = {"envs": None, "repeats": 1, "at_once": 1, "out": None}
+PROGRAMS = ("start", "prefill", "evaluation", "chunk")
+LIMIT = 30.0
+"""Seconds of a core for one program, cold: more is a defect to look into."""
+
+
+def main(argv: Sequence[str]) -> int:
+    taken, overrides = config.take(argv, tuple(DEFAULTS))
+    options = {**DEFAULTS, **taken}
+    envs = _check(options)
+    report: dict[str, Any] = {
+        "versions": devices.versions(),
+        "commit": commit(),
+        "settings": list(argv),
+        "environments": {},
+    }
+    print(f"commit {report['commit']}; wall-clock seconds (seconds of a core)")
+    print(f"{'environment':<24} {'cache':<5} {'import':>7} " + " ".join(f"{name:>14}" for name in PROGRAMS)
+          + f" {'all':>14}  of it traced and lowered", flush=True)  # fmt: skip
+    shares: Queue[set[int] | None] = Queue()
+    for share in cores(options["at_once"]):
+        shares.put(share)
+
+    def one(env: str) -> tuple[str, dict[str, Any]]:
+        share = shares.get()
+        try:
+            if share is not None:
+                os.sched_setaffinity(0, share)  # of this thread, and of the processes that it starts
+            return env, measure([f"env={env}", *overrides], options["repeats"])
+        finally:
+            shares.put(share)
+
+    with ThreadPoolExecutor(options["at_once"]) as pool:
+        for env, found in pool.map(one, envs):
+            report.setdefault("machine", found.pop("machine"))
+            found.pop("machine", None)
+            report["environments"][env] = found
+            for state in ("cold", "warm"):
+                print(row(env, state, found[state]), flush=True)
+            if options["out"] is not None:
+                Path(str(options["out"])).write_text(json.dumps(report, indent=1) + "\n")
+    for line in slow(report["environments"]):
+        print(line)
+    return 0
+
+
+def measure(overrides: Sequence[str], repeats: int) -> dict[str, Any]:
+    """{"cold", "warm": medians of what `benchmarks.compilation` reports, "machine"}."""
+    found: dict[str, list[dict[str, Any]]] = {"cold": [], "warm": []}
+    for _ in range(repeats):
+        with tempfile.TemporaryDirectory() as folder:
+            for reports in found.values():
+                reports.append(fresh.run("benchmarks.compilation", overrides, {"JAX_COMPILATION_CACHE_DIR": folder}))
+    machine = [report.pop("machine") for reports in found.values() for report in reports][0]
+    return {**{state: median(reports) for state, reports in found.items()}, "machine": machine}
+
+
+def median(reports: Sequence[Any]) -> Any:
+    """Medians, number by number, of reports of the same form (numbers in nested mappings), to hundredths."""
+    if isinstance(reports[0], Mapping):
+        return {key: median([report[key] for report in reports]) for key in reports[0]}
+    return round(float(np.median(reports)), 2)
+
+
+def row(env: str, state: str, found: Mapping[str, Any]) -> str:
+    """A line of the table."""
+    programs = [found["programs"][name] for name in PROGRAMS]
+    cells = [f"{p['seconds']:.1f} ({p['cpu']:.1f})" for p in programs]
+    cells.append(f"{found['total']:.1f} ({sum(p['cpu'] for p in programs):.1f})")
+    python = sum(p["trace"] + p["lower"] for p in programs)
+    return f"{env:<24} {state:<5} {found['import']:>7.1f} " + " ".join(f"{c:>14}" for c in cells) + f" {python:>8.1f}"
+
+
+def slow(environments: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """One line for each program that takes more than `LIMIT` of a core, cold."""
+    return [
+        f"{env}: {name} took {program['cpu']:.0f} s of a core cold, more than {LIMIT:.0f}"
+        for env, found in environments.items()
+        for name, program in found["cold"]["programs"].items()
+        if program["cpu"] > LIMIT
+    ]
+
+
+def cores(at_once: int) -> list[set[int] | None]:
+    """The cores that each of so many processes side by side has to itself; None: all, or where one cannot choose."""
+    if at_once == 1 or not hasattr(os, "sched_getaffinity"):
+        return [None] * at_once
+    there = sorted(os.sched_getaffinity(0))
+    if at_once > len(there):
+        raise UserError(f"at_once={at_once}: there are {len(there)} cores")
+    return [set(there[k::at_once]) for k in range(at_once)]
+
+
+def _check(options: Mapping[str, Any]) -> list[str]:
+    """The environments asked for. Raises UserError."""
+    valid = config.known_names("env")
+    envs = list(valid) if options["envs"] is None else options["envs"]
+    if not isinstance(envs, list):
+        envs = [envs]
+    for env in envs:
+        if env not in valid:
+            raise UserError(f"no environment is called {env!r}; {nearest(str(env), valid)}")
+    if options["out"] is not None and not Path(str(options["out"])).parent.is_dir():
+        raise UserError(f"out={options['out']}: there is no directory {Path(str(options['out'])).parent}")
+    for key in ("repeats", "at_once"):
+        if type(options[key]) is not int or options[key] < 1:
+            raise UserError(f"{key}={options[key]!r}: must be a whole number of at least 1")
+    return envs
+
+
+if __name__ == "__main__":
+    sys.argv[0] = "compile_times"
+    command.run(main)

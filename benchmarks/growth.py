@@ -1,0 +1,156 @@
+"""`python -m benchmarks.growth`: how time and memory of the whole loop grow with seeds, agents, replay and batch.
+
+    python -m benchmarks.growth [seeds=[1,2,4,8,16,32,64]] [agents=[3,6,12,24]] [replay=[10000,...,1000000]]
+                                [batch=[128,...,8192]] [few_seeds=2] [repeats=5] [seconds=1] [out=FILE.json]
+                                [key=value ...]
+
+simple_spread, each axis alone (an empty list leaves it out); the others stay at the paper's settings with `few_seeds`
+seeds and a replay of 25,600 transitions, where learning starts in the paper. Replays are full. Other keys are settings
+of the run. Each point is a process of its own (`benchmarks.loop`): time of a cycle of all seeds (200 env steps of each
+and, for MATD3, two updates), median of `repeats` stretches of `seconds`; memory as XLA counts it for the compiled
+chunk, and at most of the whole process. The exponent k of time ~ value^k is the slope of a least-squares line through
+the logarithms: over all points, and over the upper half of them. A figure is drawn beside `out`.
+"""
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks import fresh, growth_figure
+from benchmarks.throughput import commit
+from matd3_jax import command, config, devices
+from matd3_jax.errors import UserError
+
+AXES: dict[str, list[int]] = {
+    "seeds": [1, 2, 4, 8, 16, 32, 64],
+    "agents": [3, 6, 12, 24],
+    "replay": [10_000, 32_000, 100_000, 320_000, 1_000_000],
+    "batch": [128, 512, 1024, 2048, 8192],
+}
+BASE = {"agents": 3, "replay": 25_600, "batch": 1024}
+DEFAULTS: dict[str, Any] = {**AXES, "few_seeds": 2, "repeats": 5, "seconds": 1.0, "out": None}
+
+QUANTITIES = {
+    "time": lambda point: point["cycle_seconds"],
+    "products": lambda point: point["product_flops_of_a_cycle"],
+    "memory": lambda point: point["memory"]["xla"],
+    "process": lambda point: point["memory"]["process"],
+}
+"""What exponents are fitted to."""
+
+
+def main(argv: Sequence[str]) -> int:
+    taken, overrides = config.take(argv, tuple(DEFAULTS))
+    options = {**DEFAULTS, **taken}
+    _check(options)
+    report: dict[str, Any] = {
+        "versions": devices.versions(),
+        "commit": commit(),
+        "settings": list(argv),
+        "beside": {"seeds": options["few_seeds"], **BASE},
+    }
+    print(f"commit {report['commit']}; beside each axis {report['beside']}")
+    print(f"{'axis':<7} {'value':>9} {'ms a cycle':>11} {'env steps/s':>12} {'GFLOP':>8} {'XLA, MB':>9} "
+          f"{'of it replay':>12} {'temporaries':>11} {'process':>8} {'compiled in':>11}", flush=True)  # fmt: skip
+    axes: dict[str, list[dict[str, Any]]] = {}
+    report["axes"] = axes
+    measured: dict[tuple, dict[str, Any]] = {}
+    for axis in AXES:
+        for value in options[axis]:
+            point = {"seeds": options["few_seeds"], **BASE, axis: value}
+            key = tuple(point.values())
+            if key not in measured:
+                measured[key] = _measure([*settings(point), *overrides], options)
+            axes.setdefault(axis, []).append({"value": value, **measured[key]})
+            _show(axis, axes[axis][-1])
+    report["machine"] = next((m.pop("machine") for m in measured.values() if "machine" in m), None)
+    for points in axes.values():
+        for point in points:
+            point.pop("machine", None)
+    report["exponents"] = exponents(axes)
+    for axis, found in report["exponents"].items():
+        print(f"{axis}: " + "; ".join(f"{name} ~ {axis}^{k['all']:.2f} (upper half {k['upper']:.2f})"
+                                      for name, k in found.items()))  # fmt: skip
+    if options["out"] is not None:
+        out = Path(str(options["out"]))
+        out.write_text(json.dumps(report, indent=1) + "\n")
+        growth_figure.draw(out.with_suffix(".png"), axes)
+        print(f"figure: {out.with_suffix('.png')}")
+    return 0
+
+
+def settings(point: Mapping[str, int]) -> list[str]:
+    """Settings of a run at a point {"seeds", "agents", "replay", "batch"}: the replay is full when learning starts."""
+    return [
+        "env=simple_spread",
+        f"env.num_agents={point['agents']}",
+        f"seeds={point['seeds']}",
+        f"batch_size={point['batch']}",
+        f"replay_capacity={point['replay']}",
+        f"learning_starts={point['replay']}",
+        f"total_steps={2 * point['replay']}",
+        "eval_every=0",
+    ]
+
+
+def exponents(axes: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, dict[str, dict[str, float]]]:
+    """{axis: {quantity: {"all", "upper"}}}: exponents of growth over all points that were measured, and over the upper
+    half (at least two). Axes with fewer than two points are left out."""
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for axis, points in axes.items():
+        there = [point for point in points if "error" not in point]
+        if len(there) < 2:
+            continue
+        x = np.array([point["value"] for point in there], float)
+        upper = slice(min(len(x) // 2, len(x) - 2), None)
+        for name, of in QUANTITIES.items():
+            y = np.array([of(point) for point in there], float)
+            fits = {"all": exponent(x, y), "upper": exponent(x[upper], y[upper])}
+            found.setdefault(axis, {})[name] = {key: round(k, 3) for key, k in fits.items()}
+    return found
+
+
+def exponent(x: np.ndarray, y: np.ndarray) -> float:
+    """k of y ~ x^k, least squares in logarithms; x, y: [points]."""
+    return float(np.polyfit(np.log(x), np.log(y), 1)[0])
+
+
+def _measure(overrides: Sequence[str], options: Mapping[str, Any]) -> dict[str, Any]:
+    arguments = [f"repeats={options['repeats']}", f"seconds={options['seconds']}", *overrides]
+    try:
+        return fresh.run("benchmarks.loop", arguments)
+    except UserError as error:  # too large for this machine: the others still count
+        return {"error": str(error)}
+
+
+def _show(axis: str, point: Mapping[str, Any]) -> None:
+    if "error" in point:
+        print(f"{axis:<7} {point['value']:>9,} {point['error']}", flush=True)
+        return
+    mb = {name: value / 1e6 for name, value in point["memory"].items()}
+    print(f"{axis:<7} {point['value']:>9,} {1000 * point['cycle_seconds']:>11,.1f} "
+          f"{point['env_steps_per_second']:>12,.0f} {point['product_flops_of_a_cycle'] / 1e9:>8.2f} "
+          f"{mb['xla']:>9,.0f} {mb['replay']:>12,.0f} {mb['temporaries']:>11,.0f} {mb['process']:>8,.0f} "
+          f"{point['compile_seconds']:>9.1f} s", flush=True)  # fmt: skip
+
+
+def _check(options: Mapping[str, Any]) -> None:
+    for axis in AXES:
+        values = options[axis]
+        if not isinstance(values, list) or not all(type(n) is int and n >= 1 for n in values):
+            example = f"{axis}=[{','.join(map(str, AXES[axis][:3]))}]"
+            raise UserError(f"{axis}={values!r}: must be a list of whole numbers of at least 1, for instance {example}")
+    for key in ("few_seeds", "repeats"):
+        if type(options[key]) is not int or options[key] < 1:
+            raise UserError(f"{key}={options[key]!r}: must be a whole number of at least 1")
+    if options["out"] is not None and not Path(str(options["out"])).parent.is_dir():
+        raise UserError(f"out={options['out']}: there is no directory {Path(str(options['out'])).parent}")
+
+
+if __name__ == "__main__":
+    sys.argv[0] = "growth"
+    command.run(main)

@@ -1,0 +1,78 @@
+"""Time and memory over each axis of `benchmarks.growth`, in one picture."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, NullLocator
+
+from matd3_jax.plotting import COLOURS, PAPER
+
+LABELS = {"seeds": "seeds", "agents": "agents", "replay": "transitions in each replay", "batch": "minibatch"}
+ORDERS = {"agents": (2, 3)}
+"""Powers drawn for the eye; elsewhere the first."""
+MEMORY = {"process": (1, "process at most"), "xla": (0, "the chunk's, by XLA"), "replay": (4, "of it the replay")}
+NAMES = {1: "linear", 2: "quadratic", 3: "cubic"}
+
+
+def draw(path: Path, axes: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
+    """One column an axis: above, the time of a cycle, below, memory; both scales logarithmic.
+
+    Args:
+        axes: {axis: points} as `benchmarks.growth` reports them; points with an "error" are left out.
+    """
+    columns = {name: there for name, points in axes.items() if (there := [p for p in points if "error" not in p])}
+    if not columns:
+        return
+    with matplotlib.rc_context(PAPER):
+        figure = Figure(figsize=(2.6 * len(columns) + 0.6, 5.2), layout="constrained")
+        FigureCanvasAgg(figure)
+        grid = figure.subplots(2, len(columns), squeeze=False, sharex="col", sharey="row")
+        for (top, bottom), (name, points) in zip(grid.T, columns.items(), strict=True):
+            x = np.array([point["value"] for point in points], float)
+            times = 1000 * np.array([[p["cycle_seconds"], p["fastest"], p["slowest"]] for p in points])
+            top.fill_between(x, times[:, 1], times[:, 2], color=COLOURS[0], alpha=0.2, linewidth=0)
+            flops = np.array([point["product_flops_of_a_cycle"] for point in points])
+            expected = times[0, 0] * flops / flops[0]
+            top.plot(x, expected, color=COLOURS[2], linestyle=(0, (1, 1)), label="as the products")
+            _line(top, x, times[:, 0], 0, "measured")
+            for key, (colour, label) in MEMORY.items():
+                _line(bottom, x, np.array([point["memory"][key] / 1e6 for point in points]), colour, label)
+            memory = np.array([point["memory"]["xla"] / 1e6 for point in points])
+            _guides(top, x, times[0, 0], ORDERS.get(name, (1,)))
+            _guides(bottom, x, memory[0], ORDERS.get(name, (1,)))
+            bottom.set_xlabel(LABELS[name])
+        grid[0, 0].set_ylabel("ms a cycle, all seeds")
+        grid[1, 0].set_ylabel("MB")
+        _limits(grid[0], [[p["cycle_seconds"] * 1000] for points in columns.values() for p in points])
+        _limits(grid[1], [[p["memory"][key] / 1e6 for key in MEMORY] for points in columns.values() for p in points])
+        for row in grid:
+            row[-1].legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False, handlelength=2)
+        figure.savefig(path, dpi=200)
+
+
+def _line(axis: Axes, x: np.ndarray, y: np.ndarray, colour: int, label: str) -> None:
+    axis.loglog(x, y, color=COLOURS[colour], linewidth=1.4, marker="o", markersize=3, label=label)
+    axis.xaxis.set_minor_locator(NullLocator())
+    axis.set_xticks(x, [f"{v:.0f}" if v < 10_000 else EngFormatter(sep="")(v) for v in x], rotation=45)
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.grid(alpha=0.25)
+
+
+def _guides(axis: Axes, x: np.ndarray, first: float, orders: Sequence[int]) -> None:
+    """Powers of x from the first point on, grey, with their names at the end."""
+    for order in orders:
+        y = first * (x / x[0]) ** order
+        axis.plot(x, y, color="0.6", linewidth=0.8, linestyle=(0, (5, 1.5)), zorder=1)
+        axis.annotate(NAMES[order], (x[-1], y[-1]), color="0.4", fontsize=7, ha="right", va="bottom")
+
+
+def _limits(row: np.ndarray, values: Sequence[Sequence[float]]) -> None:
+    """As high and low as what was measured, with room: a power may leave the picture."""
+    flat = [value for some in values for value in some if value > 0]
+    row[0].set_ylim(min(flat) / 1.5, max(flat) * 1.5)
