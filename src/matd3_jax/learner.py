@@ -9,6 +9,7 @@ from typing import NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 
@@ -40,8 +41,19 @@ class UpdateMetrics(NamedTuple):
     """NaN where this update left the actor alone."""
 
 
+class Place(NamedTuple):
+    """Where an agent stands, int32 scalars; leaves [members] for several."""
+
+    agent: chex.Array
+    """Its number."""
+    observation: chex.Array
+    """First entry of o_i in x."""
+    action: chex.Array
+    """First entry of a_i in the joint action."""
+
+
 class Minibatch(NamedTuple):
-    """What one agent learns from in one update; a leading axis [members] for several."""
+    """What one agent learns from in one update."""
 
     observation: chex.Array
     """[batch, observation size] o_i."""
@@ -57,8 +69,8 @@ class Minibatch(NamedTuple):
     """o' of those whose target actors the target needs, one array [agents, batch, observation size] per group."""
     next_x: chex.Array
     """[batch, critic inputs without actions] x', or o'_i."""
-    action_column: chex.Array
-    """int32 scalar: where a_i stands in `inputs`."""
+    action_column: chex.Array | int
+    """Where a_i stands in `inputs`."""
 
 
 class Noise(NamedTuple):
@@ -140,32 +152,50 @@ def update(
     """
     mu_targets = [group.actor_target for group in state]
     keys = jax.random.split(key, len(spec.groups))
-    batches = [_minibatches(spec, group, rows, h.gamma) for group, h in zip(spec.groups, hyper, strict=True)]
+    places = [_places(spec, group) for group in spec.groups]
     noises = [_noise(spec, group, rows.shape[:2], k, axis) for group, k in zip(spec.groups, keys, strict=True)]
     new, metrics = list(state), jnp.full((3, spec.num_agents), jnp.nan)
 
+    def cut(g: int, place: Place) -> Minibatch:
+        own = rows[0] if rows.shape[0] == 1 else jax.lax.dynamic_index_in_dim(rows, place.agent, keepdims=False)
+        return _minibatch(spec, spec.groups[g], own, place, hyper[g].gamma)
+
+    def minibatches(g: int) -> Place | Minibatch:
+        """Of all members, stacked; one by one each is cut out in its turn, as all N together hold N times N parts."""
+        if one_by_one:
+            return places[g]
+        members = range(len(spec.groups[g].members))
+        return jax.tree.map(
+            lambda *m: jnp.stack(m), *(cut(g, jax.tree.map(lambda p, k=k: p[k], places[g])) for k in members)
+        )
+
     def member(g: int, targets: Sequence[chex.ArrayTree], next_action: chex.Array | None = None):
         def f(args):
-            return _update_agent(spec, spec.groups[g], hyper[g], move[g], axis, targets, *args, next_action)
+            state, own_target, batch, noise = args
+            batch = cut(g, batch) if one_by_one else batch
+            return _update_agent(
+                spec, spec.groups[g], hyper[g], move[g], axis, targets, state, own_target, batch, noise, next_action
+            )
 
         return f
 
     if sequential:
         for i in range(spec.num_agents):
             g, k = spec.place(i)
-            args = jax.tree.map(lambda leaf, k=k: leaf[k], (state[g], mu_targets[g], batches[g], noises[g]))
+            args = jax.tree.map(lambda leaf, k=k: leaf[k], (state[g], mu_targets[g], minibatches(g), noises[g]))
             after, m = member(g, mu_targets)(args)
             new[g] = jax.tree.map(lambda old, one, k=k: old.at[k].set(one), new[g], after)
             mu_targets[g] = new[g].actor_target
             metrics = metrics.at[:, i].set(jnp.stack(m))
     else:
         for g, group in enumerate(spec.groups):
-            args = (state[g], mu_targets[g], batches[g], noises[g])
+            args = (state[g], mu_targets[g], minibatches(g), noises[g])
             next_action = None
             if rows.shape[0] == 1 and group.algorithm.critic == "central":
                 # One minibatch for all: its target actions are the same for every member, so compute them once.
-                _, *first = jax.tree.map(lambda leaf: leaf[0], args)
-                next_action = _target_actions(spec, group, hyper[g], mu_targets, *first)
+                _, own_target, batch, noise = jax.tree.map(lambda leaf: leaf[0], args)
+                batch = cut(g, batch) if one_by_one else batch
+                next_action = _target_actions(spec, group, hyper[g], mu_targets, own_target, batch, noise)
             new[g], m = jax.lax.map(
                 member(g, mu_targets, next_action), args, batch_size=None if one_by_one else len(group.members)
             )
@@ -271,32 +301,36 @@ def _target_actions(
     return spec.join_actions(parts) if group.algorithm.critic == "central" else parts[0]
 
 
-def _minibatches(spec: Spec, group: Group, rows: chex.Array, gamma: chex.Array | float) -> Minibatch:
-    """The minibatches of a group's members, stacked."""
-    shared = rows.shape[0] == 1
+def _places(spec: Spec, group: Group) -> Place:
+    """Of all members, leaves [members]."""
+    members = np.array(group.members)
+    return Place(members, np.array(spec.observation_starts)[members], np.array(spec.action_starts)[members])
+
+
+def _minibatch(spec: Spec, group: Group, rows: chex.Array, place: Place, gamma: chex.Array | float) -> Minibatch:
+    """The minibatch of one member from its rows [batch, row_size]."""
     central = group.algorithm.critic == "central"
+    parts = spec.row_parts(rows)
 
-    def one(i: int) -> Minibatch:
-        parts = spec.row_parts(rows[0 if shared else i])
-        observation = spec.observation_part(parts.x, i)
-        action = spec.action_part(parts.action, i)
-        own_next = spec.observation_part(parts.next_x, i)
-        every_next = tuple(
-            jnp.stack([spec.observation_part(parts.next_x, j) for j in other.members]) for other in spec.groups
-        )
-        column = spec.observation_size + spec.action_starts[i] if central else group.observation_size
-        return Minibatch(
-            observation=observation,
-            action=action,
-            inputs=parts.inputs if central else jnp.concatenate([observation, action], axis=-1),
-            reward=parts.reward[..., i],
-            discount=parts.discount if parts.more is None else parts.discount * gamma**parts.more,
-            next_observations=every_next if central else (own_next,),
-            next_x=parts.next_x if central else own_next,
-            action_column=jnp.int32(column),
-        )
+    def part(whole: chex.Array, start: chex.Array, size: int) -> chex.Array:
+        return jax.lax.dynamic_slice_in_dim(whole, start, size, axis=-1)
 
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(one(i) for i in group.members))
+    observation = part(parts.x, place.observation, group.observation_size)
+    action = part(parts.action, place.action, group.action_space.size)
+    own_next = part(parts.next_x, place.observation, group.observation_size)
+    every_next = tuple(
+        jnp.stack([spec.observation_part(parts.next_x, j) for j in other.members]) for other in spec.groups
+    )
+    return Minibatch(
+        observation=observation,
+        action=action,
+        inputs=parts.inputs if central else jnp.concatenate([observation, action], axis=-1),
+        reward=part(parts.reward, place.agent, 1)[..., 0],
+        discount=parts.discount if parts.more is None else parts.discount * gamma**parts.more,
+        next_observations=every_next if central else (own_next,),
+        next_x=parts.next_x if central else own_next,
+        action_column=spec.observation_size + place.action if central else group.observation_size,
+    )
 
 
 def _noise(spec: Spec, group: Group, shape: tuple[int, int], key: chex.PRNGKey, axis: str | None) -> Noise:
