@@ -6,8 +6,8 @@
 
 Peers that fit beside this package are installed with its extra `peers`; the others get virtual environments under
 `envs` (default: peers in the cache folder). The rows are fixed (`benchmarks/peers_scripts/rows.py`); `only` leaves out
-whole peers. Everything runs on the CPU, and never two sides at once: in each turn every way to do the work is measured for
-`seconds`, ours and the peer's one after the other, the order reversed from turn to turn; compilation is not counted.
+whole peers. Everything runs on the CPU, and never two sides at once: in each turn every way to do the work is measured
+for `seconds`, ours and the peer's one after the other, the order reversed from turn to turn; compilation is not counted.
 A row gives medians over the turns with the lowest and the highest; the ratio is that of the same turn. Where a side can
 do the work in several ways (environments, threads, batch), the one with the highest median stands in the table, and all
 of them in the JSON. A peer that fails stands there with its error. The markdown table comes last.
@@ -54,7 +54,9 @@ def main(argv: Sequence[str]) -> int:
     }
     for key in ("machine", "versions", "commit", "gflops_before"):
         print(f"{key}: {report[key]}", flush=True)
-    lines, all_versions, entries = [], {}, []
+    lines: list[list[str]] = []
+    entries: list[dict[str, Any]] = []
+    all_versions: dict[str, dict[str, str | None]] = {}
     for name, group in rows.groups(cores).items():
         if name in options["only"]:
             outcomes, versions = measure(group, options["turns"], options["seconds"], folder)
