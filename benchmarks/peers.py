@@ -8,9 +8,9 @@ Peers that fit beside this package are installed with its extra `peers`; the oth
 `envs` (default: peers in the cache folder). The rows are fixed (`benchmarks/peers_scripts/rows.py`); `only` leaves out
 whole peers. Everything runs on the CPU, and never two sides at once: in each turn every way to do the work is measured
 for `seconds` (compilation left out), ours and the peer's one after the other, the order reversed from turn to turn. A
-row gives medians over the turns with the lowest and the highest; the ratio is that of the same turn. Where a side can do
-the work in several ways (environments, threads, batch), the one with the highest median stands in the table, and all of
-them in the JSON. A peer that fails stands there with its error. The markdown table comes last.
+row gives medians over the turns with the lowest and the highest; the ratio is that of the same turn. Where a side can
+do the work in several ways (environments, threads, batch), the one with the highest median stands in the table, and
+all of them in the JSON. A peer that fails stands there with its error. The markdown table comes last.
 """
 
 import json
