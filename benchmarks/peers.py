@@ -1,7 +1,7 @@
 """`python -m benchmarks.peers`: env steps/s of this trainer beside other programs that do the same work, in one run.
 
     python -m benchmarks.peers prepare=true [envs=DIR]          once: environments for the peers that need their own
-    python -m benchmarks.peers [turns=3] [seconds=3] [only=[agilerl,jaxmarl,mpe2,gymnasium,rejax]] [envs=DIR]
+    python -m benchmarks.peers [turns=3] [seconds=2] [only=[agilerl,jaxmarl,mpe2,gymnasium,rejax]] [envs=DIR]
                                [out=FILE.json]
 
 Peers that fit beside this package are installed with its extra `peers`; the others get virtual environments under
@@ -31,7 +31,7 @@ from matd3_jax import command, config, devices
 from matd3_jax.envs.base import nearest
 from matd3_jax.errors import UserError
 
-DEFAULTS: dict[str, Any] = {"prepare": False, "turns": 3, "seconds": 3.0, "only": None, "envs": None, "out": None}
+DEFAULTS: dict[str, Any] = {"prepare": False, "turns": 3, "seconds": 2.0, "only": None, "envs": None, "out": None}
 PATHS = ("envs", "out")
 
 Outcome = list[float] | str
