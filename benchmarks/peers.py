@@ -1,0 +1,245 @@
+"""`python -m benchmarks.peers`: env steps/s of this trainer beside other programs that do the same work, in one run.
+
+    python -m benchmarks.peers prepare=true [envs=DIR]          once: environments for the peers that need their own
+    python -m benchmarks.peers [turns=3] [seconds=2] [only=[agilerl,jaxmarl,mpe2,gymnasium,rejax]] [envs=DIR]
+                               [out=FILE.json]
+
+Peers that fit beside this package are installed with its extra `peers`; the others get virtual environments under
+`envs` (default: peers in the cache folder). The rows are fixed (`benchmarks/peers_scripts/rows.py`); `only` leaves out
+whole peers. Everything runs on the CPU, and never two sides at once: in each turn every way to do the work is measured
+for `seconds` (compilation left out), ours and the peer's one after the other, the order reversed from turn to turn. A
+row gives medians over the turns with the lowest and the highest; the ratio is that of the same turn. Where a side can
+do the work in several ways (environments, threads, batch), the one with the highest median stands in the table, and
+all of them in the JSON. A peer that fails stands there with its error. The markdown table comes last.
+"""
+
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks import throughput
+from benchmarks.peers_scripts import process, rows
+from benchmarks.peers_scripts.process import Process, WorkerError
+from benchmarks.peers_scripts.rows import WORKERS, Row, Variant
+from matd3_jax import command, config, devices
+from matd3_jax.envs.base import nearest
+from matd3_jax.errors import UserError
+
+DEFAULTS: dict[str, Any] = {"prepare": False, "turns": 3, "seconds": 2.0, "only": None, "envs": None, "out": None}
+PATHS = ("envs", "out")
+
+Outcome = list[float] | str
+"""Env steps/s of a variant, one for each turn, or the line that says why there are none."""
+
+
+def main(argv: Sequence[str]) -> int:
+    options = _options(argv)
+    folder = options["envs"]
+    if options["prepare"]:
+        return prepare(folder, options["only"])
+    devices.prepare()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    report: dict[str, Any] = {
+        "machine": devices.description(),
+        "versions": devices.versions(),
+        "commit": throughput.commit(),
+        "settings": list(argv),
+        "gflops_before": throughput.matmul_gflops(),
+    }
+    for key in ("machine", "versions", "commit", "gflops_before"):
+        print(f"{key}: {report[key]}", flush=True)
+    lines: list[list[str]] = []
+    entries: list[dict[str, Any]] = []
+    all_versions: dict[str, dict[str, str | None]] = {}
+    for name, group in rows.groups(cores).items():
+        if name in options["only"]:
+            outcomes, versions = measure(group, options["turns"], options["seconds"], folder)
+            all_versions |= versions
+            entries += [entry(row, outcomes) for row in group]
+            lines += [line(row, outcomes, versions) for row in group]
+    report |= {"peers": all_versions, "rows": entries, "gflops_after": throughput.matmul_gflops()}
+    print(f"gflops_after: {report['gflops_after']}\n")
+    print(table(lines))
+    if options["out"] is not None:
+        options["out"].write_text(json.dumps(report, indent=1) + "\n")
+    return 0
+
+
+def prepare(folder: Path, only: Sequence[str]) -> int:
+    """Make the environments; 1 if one of them fails."""
+    failed = False
+    for name, worker in WORKERS.items():
+        if worker.requirements and name.lower() in only:
+            print(f"{name}: {'; '.join(' '.join(part) for part in worker.requirements)}", flush=True)
+            error = process.install(worker, folder)
+            print(f"{name}: {error or 'installed'}", flush=True)
+            failed |= error is not None
+    return int(failed)
+
+
+# ---- measuring -------------------------------------------------------------------------------------------------------
+
+
+def measure(
+    group: Sequence[Row], turns: int, seconds: float, folder: Path
+) -> tuple[dict[str, Outcome], dict[str, dict[str, str | None]]]:
+    """Env steps/s of every variant of a group of rows, keyed by `key`, and the versions that each worker reports."""
+    variants = {key(v): v for row in group for v in (*row.ours, *row.peer)}
+    outcomes: dict[str, Outcome] = {k: [] for k in variants}
+    versions: dict[str, dict[str, str | None]] = {}
+    pools: dict[str, list[Process]] = {}
+    with tempfile.TemporaryDirectory() as logs:
+        try:
+            for k, variant in variants.items():
+                try:
+                    pool = _pool(variant, pools, folder, Path(logs))
+                    if variant.worker not in versions:
+                        versions[variant.worker] = _ask(pool[:1], do="versions")[0]
+                    took = _ask(pool, do="prepare", case=variant.case)[0]["seconds"]
+                    print(f"{variant.worker}, {variant.label}: ready in {took:.0f} s", flush=True)
+                except WorkerError as error:
+                    outcomes[k] = str(error)
+                    print(f"{variant.worker}, {variant.label}: {error}", flush=True)
+            for turn in range(turns):
+                for k, variant in list(variants.items())[:: -1 if turn % 2 else 1]:
+                    outcome = outcomes[k]
+                    if isinstance(outcome, str):
+                        continue
+                    try:
+                        pool = pools[variant.worker][: variant.processes]
+                        answers = _ask(pool, do="measure", case=variant.case, seconds=seconds)
+                        outcome.append(sum(a["env_steps"] / a["seconds"] for a in answers))
+                        print(f"turn {turn + 1}: {variant.worker}, {variant.label}: {outcome[-1]:,.0f}", flush=True)
+                    except WorkerError as error:
+                        outcomes[k] = str(error)
+                        print(f"turn {turn + 1}: {variant.worker}, {variant.label}: {error}", flush=True)
+        finally:
+            for pool in pools.values():
+                for member in pool:
+                    member.close()
+    return outcomes, versions
+
+
+def _pool(variant: Variant, pools: dict[str, list[Process]], folder: Path, logs: Path) -> list[Process]:
+    """As many processes of the variant's worker as it takes; started where they are missing."""
+    worker = WORKERS[variant.worker]
+    pool = pools.setdefault(variant.worker, [])
+    while len(pool) < variant.processes:
+        python = process.python_of(variant.worker, worker, folder)
+        pool.append(Process(python, worker, folder / "jax_cache", logs / f"{variant.worker} {len(pool)}"))
+    return pool[: variant.processes]
+
+
+def _ask(pool: Sequence[Process], **request: Any) -> list[dict[str, Any]]:
+    """The same question to all at once."""
+    for member in pool:
+        member.send(**request)
+    return [member.receive() for member in pool]
+
+
+# ---- the table -------------------------------------------------------------------------------------------------------
+
+
+def key(variant: Variant) -> str:
+    """What tells variants apart; rows may share them."""
+    return json.dumps([variant.worker, variant.case, variant.processes], sort_keys=True)
+
+
+def best(side: Sequence[Variant], outcomes: dict[str, Outcome]) -> tuple[Variant, Outcome]:
+    """The variant with the highest median, or the first with its error where none was measured."""
+    measured = [(v, o) for v in side if not isinstance(o := outcomes[key(v)], str)]
+    if not measured:
+        return side[0], outcomes[key(side[0])]
+    return max(measured, key=lambda pair: float(np.median(pair[1])))
+
+
+def entry(row: Row, outcomes: dict[str, Outcome]) -> dict[str, Any]:
+    """A row for the JSON, with every variant."""
+    found: dict[str, Any] = {"work": row.work}
+    for name, side in (("ours", row.ours), ("peer", row.peer)):
+        found[name] = [
+            {
+                "worker": v.worker,
+                "label": v.label,
+                "processes": v.processes,
+                "case": v.case,
+                ("error" if isinstance(outcomes[key(v)], str) else "env_steps_per_second"): outcomes[key(v)],
+            }
+            for v in side
+        ]
+    ours, peer = best(row.ours, outcomes)[1], best(row.peer, outcomes)[1]
+    found["ratio"] = None if isinstance(ours, str) or isinstance(peer, str) else spread(np.divide(ours, peer))
+    return found
+
+
+def line(row: Row, outcomes: dict[str, Outcome], versions: dict[str, dict[str, str | None]]) -> list[str]:
+    """A row's cells: work, peer, env steps/s of ours and the peer's, ratio."""
+    (mine, ours), (other, peer) = best(row.ours, outcomes), best(row.peer, outcomes)
+    failed = isinstance(ours, str) or isinstance(peer, str)
+    ratio = "" if failed else _range(spread(np.divide(ours, peer)), digits=True)
+    version = versions.get(other.worker, {}).get(WORKERS[other.worker].package) or ""
+    name = f"{other.worker} {version}".strip()
+    return [row.work, name, f"{_rates(ours)}; {mine.label}", f"{_rates(peer)}; {other.label}", ratio]
+
+
+def table(lines: Sequence[Sequence[str]]) -> str:
+    """Markdown."""
+    head = ["work", "peer", "ours, env steps/s", "peer, env steps/s", "ours / peer"]
+    cells = [[cell.replace("|", "\\|") for cell in cells] for cells in (head, ["---"] * len(head), *lines)]
+    return "\n".join("| " + " | ".join(row) + " |" for row in cells)
+
+
+def spread(values: Sequence[float] | np.ndarray) -> dict[str, float]:
+    """Median, lowest and highest."""
+    return {"median": float(np.median(values)), "lowest": float(np.min(values)), "highest": float(np.max(values))}
+
+
+def _rates(outcome: Outcome) -> str:
+    return f"failed: {outcome}" if isinstance(outcome, str) else _range(spread(outcome))
+
+
+def _range(found: dict[str, float], digits: bool = False) -> str:
+    """`digits`: three significant ones for small numbers."""
+    texts = [f"{v:,.{max(0, 2 - int(np.floor(np.log10(v)))) if digits else 0}f}" for v in found.values()]
+    return f"**{texts[0]}** ({texts[1]} to {texts[2]})"
+
+
+# ---- options ---------------------------------------------------------------------------------------------------------
+
+
+def _options(argv: Sequence[str]) -> dict[str, Any]:
+    paths, rest = config.take_text(argv, PATHS)
+    taken, unknown = config.take(rest, tuple(DEFAULTS))
+    if unknown:
+        name = unknown[0].split("=")[0]
+        raise UserError(f"there is no key {name!r}; {nearest(name, DEFAULTS)}")
+    options = {**DEFAULTS, **taken}
+    if type(options["prepare"]) is not bool:
+        raise UserError(f"prepare={options['prepare']!r}: must be true or false")
+    if type(options["turns"]) is not int or options["turns"] < 1:
+        raise UserError(f"turns={options['turns']!r}: must be a whole number of at least 1")
+    if type(options["seconds"]) not in (int, float) or not 0 < options["seconds"] < float("inf"):
+        raise UserError(f"seconds={options['seconds']!r}: must be a positive number")
+    known = list(rows.groups(1))
+    only = known if options["only"] is None else options["only"]
+    options["only"] = only if isinstance(only, list) else [only]
+    for name in options["only"]:
+        if name not in known:
+            raise UserError(f"only={name!r}: no such peer; {nearest(name, known)}")
+    home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    options["envs"] = Path(paths["envs"]).absolute() if "envs" in paths else home / "matd3_jax" / "peers"
+    options["out"] = Path(paths["out"]) if "out" in paths else None
+    if options["out"] is not None and not options["out"].absolute().parent.is_dir():
+        raise UserError(f"out={options['out']}: there is no directory {options['out'].absolute().parent}")
+    return options
+
+
+if __name__ == "__main__":
+    sys.argv[0] = "peers"
+    command.run(main)
