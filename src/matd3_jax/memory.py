@@ -21,7 +21,7 @@ def needed(trainer: Trainer, seeds: int) -> int:
     Args:
         trainer: of any number of seeds; its schedule, environment and algorithms count.
     """
-    devices = min(seeds, len(jax.devices()))
+    devices = min(seeds, len(jax.local_devices()))
     rows = math.ceil(seeds / devices) * devices
     replay = trainer.replay_bytes // trainer.rows
     together = devices if trainer.on_cpu else rows  # seeds updated at the same time
@@ -67,7 +67,8 @@ def most_seeds(trainer: Trainer, budget: int) -> int:
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (middle, high) if needed(trainer, middle) <= budget else (low, middle)
-    return max(low // len(jax.devices()) * len(jax.devices()), min(low, len(jax.devices())))
+    devices = len(jax.local_devices())
+    return max(low // devices * devices, min(low, devices))
 
 
 def fitting_seeds(config: Config, budget: int) -> int:
