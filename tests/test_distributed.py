@@ -76,7 +76,7 @@ def test_settings_name_a_cluster_also_on_slurm():
 
 def test_a_port_in_use_and_an_unknown_host_are_told_of(monkeypatch):
     monkeypatch.setattr(cluster, "START_SECONDS", 0)
-    with socket.create_server(("", 0), family=socket.AF_INET6 if socket.has_ipv6 else socket.AF_INET) as taken:
+    with socket.create_server(("", 0)) as taken:
         address = f"localhost:{taken.getsockname()[1]}"
         with pytest.raises(UserError, match="cannot open port"):
             cluster.look_for(address, first=True)

@@ -84,13 +84,16 @@ def look_for(address: str, first: bool) -> None:
     except OSError as error:
         raise UserError(f"coordinator_address={address}: there is no host {host} ({error.strerror})") from error
     if first:
-        try:
-            with socket.socket(socket.AF_INET6) as probe:
-                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                probe.bind(("", int(port)))
-        except OSError as error:
-            if error.errno in (errno.EADDRINUSE, errno.EACCES):  # others: a machine without IPv6, say
-                raise UserError(f"coordinator_address={address}: cannot open port {port} ({error.strerror})") from error
+        for family in (socket.AF_INET6, socket.AF_INET):
+            try:
+                with socket.socket(family) as probe:
+                    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                    probe.bind(("", int(port)))
+            except OSError as error:
+                if error.errno in (errno.EADDRINUSE, errno.EACCES):  # others: a machine without IPv6, say
+                    raise UserError(
+                        f"coordinator_address={address}: cannot open port {port} ({error.strerror})"
+                    ) from None
         return
     deadline = time.monotonic() + START_SECONDS
     while True:
