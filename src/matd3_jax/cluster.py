@@ -91,9 +91,8 @@ def look_for(address: str, first: bool) -> None:
                     probe.bind(("", int(port)))
             except OSError as error:
                 if error.errno in (errno.EADDRINUSE, errno.EACCES):  # others: a machine without IPv6, say
-                    raise UserError(
-                        f"coordinator_address={address}: cannot open port {port} ({error.strerror})"
-                    ) from None
+                    why = f"cannot open port {port} ({error.strerror})"
+                    raise UserError(f"coordinator_address={address}: {why}") from None
         return
     deadline = time.monotonic() + START_SECONDS
     while True:
