@@ -1,17 +1,18 @@
 """Checkpoints: everything a run carries, written with Orbax, checked by checksum before it is read back.
 
-Layout of one: `STEP/state` (all but the replay), `STEP/replay/SEED` (the rows filled so far; none in what a sweep
-leaves of its runs), `STEP/checksums.json`. A checkpoint appears under its name only when it is whole. The replay is
-written and read one seed at a time, so that it never stands in memory twice.
+Layout of one: `STEP/state` (all but the replay; several processes write `STEP/state/FIRST`, each its seeds, from number
+FIRST on), `STEP/replay/SEED` (the rows filled so far; none in what a sweep leaves of its runs), `STEP/checksums.json`.
+A checkpoint appears under its name only when it is whole. The replay is written and read one seed at a time, so that it
+never stands in memory twice. What some processes wrote any other number of them can read.
 """
 
 import hashlib
 import json
 import logging
 import shutil
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,31 +20,58 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from matd3_jax import replay
+from matd3_jax.distributed import ALONE, Share
 from matd3_jax.errors import UserError
 from matd3_jax.trainer import Trainer, TrainState
 
 logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax tells of every step at INFO and warns of its own defaults.
 
 
-def save(folder: Path, step: int, trainer: Trainer, state: TrainState, keep: int, seeds: slice | None = None) -> Path:
+def save(
+    folder: Path,
+    step: int,
+    trainer: Trainer,
+    state: TrainState,
+    keep: int,
+    seeds: slice | None = None,
+    share: Share | None = None,
+) -> Path:
     """Write the checkpoint of env step `step` and delete all but the newest `keep`.
 
     Args:
         seeds: write these seeds' part alone, without their replay: enough to evaluate them, not to go on. None: all.
+        share: which seeds the trainer has. Every process writes its own, the first makes a checkpoint of it. None:
+            there are no others.
     """
+    share = share or ALONE.share(trainer.num_seeds)
+    processes, wanted = share.processes, seeds or slice(0, share.total)
     folder = folder.resolve()
     final, partial_ = folder / str(step), folder / f".{step}.partial"
-    shutil.rmtree(partial_, ignore_errors=True)
+    if processes.first:
+        shutil.rmtree(partial_, ignore_errors=True)
+        partial_.mkdir(parents=True)
+    processes.barrier()
+    written = []
+    first, last = max(share.first, wanted.start), min(share.last, wanted.stop)
     with ocp.StandardCheckpointer() as checkpointer:
-        checkpointer.save(partial_ / "state", _leaves(trainer, state, seeds or slice(None)))
+        if first < last:
+            written.append(partial_ / "state")
+            if last - first < wanted.stop - wanted.start:
+                written[0] /= str(first - wanted.start)
+            own = slice(first - share.first, last - share.first)
+            checkpointer.save(written[0], _leaves(trainer, state, own))
         for seed, rows in _replay_rows(trainer, state) if seeds is None else ():
-            checkpointer.save(partial_ / "replay" / str(seed), {"rows": rows})
+            written.append(partial_ / "replay" / str(share.first + seed))
+            checkpointer.save(written[-1], {"rows": rows})
             checkpointer.wait_until_finished()
-    (partial_ / "checksums.json").write_text(json.dumps(_checksums(partial_), indent=1))
-    shutil.rmtree(final, ignore_errors=True)
-    partial_.rename(final)
-    for old in steps(folder)[:-keep]:
-        shutil.rmtree(folder / str(old))
+    parts = processes.collect(json.dumps(_checksums(partial_, written)).encode())
+    if processes.first:
+        checksums = dict(sorted(pair for part in parts for pair in json.loads(part).items()))
+        (partial_ / "checksums.json").write_text(json.dumps(checksums, indent=1))
+        shutil.rmtree(final, ignore_errors=True)
+        partial_.rename(final)
+        for old in steps(folder)[:-keep]:
+            shutil.rmtree(folder / str(old))
     return final
 
 
@@ -76,21 +104,24 @@ def verify(folder: Path, step: int | None = None) -> Path:
     return path
 
 
-def restore(path: Path, trainer: Trainer) -> TrainState:
+def restore(path: Path, trainer: Trainer, share: Share | None = None) -> TrainState:
     """The state in the checkpoint at `path`, as `verify` gave it. Raises UserError if it holds no replay or does not
-    fit the trainer."""
+    fit the trainer.
+
+    share: which of the checkpoint's seeds the trainer has; None: all.
+    """
     if not (path / "replay").is_dir():
         raise UserError(f"{path} holds no replay: what a sweep leaves of a run can be evaluated, not gone on with")
+    share = share or ALONE.share(trainer.num_seeds)
+    small = _rebuild(trainer, path, share)
     with ocp.StandardCheckpointer() as checkpointer:
-        saved = checkpointer.restore(path / "state")
-        small = _rebuild(trainer, saved, path)
         filled = trainer.filled_rows(int(small.collects))
         local = []
         for device, seeds in trainer.device_seeds():
             shape = (len(seeds), trainer.schedule.replay_capacity, trainer.spec.row_size)
             rows = jax.device_put(jnp.zeros(shape, jnp.float32, device=device), device)
             for place, seed in enumerate(seeds):
-                one = np.asarray(checkpointer.restore(path / "replay" / str(seed))["rows"])
+                one = np.asarray(checkpointer.restore(path / "replay" / str(share.first + seed))["rows"])
                 if one.shape[0] > shape[1] or one.shape[0] < filled or one.shape[1] != shape[2]:
                     raise UserError(f"{path}: a replay of shape {one.shape} does not fit these settings")
                 rows = _put_rows(rows, jax.device_put(one[None], device), place)
@@ -102,8 +133,26 @@ def restore(path: Path, trainer: Trainer) -> TrainState:
 
 def restore_actors(path: Path, trainer: Trainer) -> TrainState:
     """The state without its replay (an empty one in its place): enough to evaluate."""
+    return _rebuild(trainer, path, ALONE.share(trainer.num_seeds))
+
+
+def read_state(path: Path, first: int, last: int, total: int) -> dict[str, np.ndarray]:
+    """Leaves of the state by path, with the seeds from number `first` to before `last` of the checkpoint's `total`."""
+    starts = sorted(int(part.name) for part in (path / "state").iterdir() if part.name.isdigit())
+    ends = [*starts[1:], total] if starts else [total]
+    found: list[dict[str, np.ndarray]] = []
     with ocp.StandardCheckpointer() as checkpointer:
-        return _rebuild(trainer, checkpointer.restore(path / "state"), path)
+        for start, end in zip(starts or [0], ends, strict=True):
+            if first < end and start < last:
+                saved = checkpointer.restore(path / "state" / str(start) if starts else path / "state")
+                leaves = {name: np.asarray(leaf) for name, leaf in saved.items()}
+                if any(leaf.ndim and len(leaf) != end - start for leaf in leaves.values()):
+                    raise UserError(f"{path} has other seeds than these settings")
+                own = slice(max(first - start, 0), last - start)
+                found.append({name: leaf[own] if leaf.ndim else leaf for name, leaf in leaves.items()})
+    return {
+        name: np.concatenate([part[name] for part in found]) if leaf.ndim else leaf for name, leaf in found[0].items()
+    }
 
 
 @partial(jax.jit, donate_argnums=0, static_argnums=2)
@@ -132,14 +181,15 @@ def _leaves(trainer: Trainer, state: TrainState, seeds: slice) -> dict[str, np.n
     return {name: leaf[: trainer.num_seeds][seeds] if leaf.ndim else leaf for name, leaf in whole.items()}
 
 
-def _rebuild(trainer: Trainer, saved: dict[str, Any], path: Path) -> TrainState:
+def _rebuild(trainer: Trainer, path: Path, share: Share) -> TrainState:
+    saved = read_state(path, share.first, share.last, share.total)
     template = trainer.abstract_state()
     shape = jax.eval_shape(jax.random.key_data, template.key)
     template = template._replace(replay=None, key=shape)  # type: ignore[arg-type]
     names, treedef = jax.tree_util.tree_flatten_with_path(template)
     leaves = []
     for name, leaf in names:
-        value = np.asarray(saved.get(jax.tree_util.keystr(name), np.nan))
+        value = saved.get(jax.tree_util.keystr(name), np.array(np.nan))
         wanted = (trainer.num_seeds, *leaf.shape[1:]) if leaf.ndim else ()
         if value.shape != wanted or value.dtype != leaf.dtype:
             raise UserError(f"{path}: {jax.tree_util.keystr(name)} does not fit these settings")
@@ -151,8 +201,9 @@ def _rebuild(trainer: Trainer, saved: dict[str, Any], path: Path) -> TrainState:
     return jax.device_put(state, trainer.shardings)
 
 
-def _checksums(path: Path) -> dict[str, str]:
-    files = sorted(file for file in path.rglob("*") if file.is_file())
+def _checksums(path: Path, folders: Sequence[Path]) -> dict[str, str]:
+    """Digests of all files in `folders`, by their names from `path` on."""
+    files = (file for folder in folders for file in folder.rglob("*") if file.is_file())
     return {str(file.relative_to(path)): _digest(file) for file in files}
 
 

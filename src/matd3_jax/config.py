@@ -15,7 +15,7 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from matd3_jax import devices
+from matd3_jax import cluster, devices
 from matd3_jax.algorithms import Algorithm, HyperParams
 from matd3_jax.envs.base import nearest
 from matd3_jax.errors import UserError
@@ -164,7 +164,12 @@ def load(overrides: Sequence[str] = ()) -> Config:
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(_one_line(error)) from error
     assert isinstance(resolved, dict)
-    for key in ("resume", "checkpoint", "robot"):  # the command's own, see train.py; what robots bring is in its place
+    for key in (
+        "resume",
+        "checkpoint",
+        *cluster.KEYS,
+        "robot",
+    ):  # the command's own, see train.py; what robots bring is in its place
         resolved.pop(key, None)
     return from_dict(resolved)  # type: ignore[arg-type]
 

@@ -75,19 +75,23 @@ def processor() -> str:
         return platform.processor() or platform.machine()
 
 
-def free_memory() -> int:
-    """Bytes that arrays may take up on JAX's devices together: the accelerators' limits, or what the machine (and the
-    control group, in a container) has free."""
+def free_memory(sharing: int = 1) -> int:
+    """Bytes that arrays may take up on this process's devices together: the accelerators' limits, or its part of what
+    the machine (and the control group, in a container) has free.
+
+    Args:
+        sharing: processes that share the machine's memory; accelerators are not shared.
+    """
     devices = jax.local_devices()
     if devices[0].platform != "cpu":
         stats = [d.memory_stats() or {} for d in devices]
         limits = [s["bytes_limit"] - s.get("bytes_in_use", 0) for s in stats if "bytes_limit" in s]
         if limits:
             return sum(limits)
-    free = psutil.virtual_memory().available
+    free = psutil.virtual_memory().available // sharing
     group = Path("/sys/fs/cgroup")
     try:
         limit = int((group / "memory.max").read_text())
-        return min(free, limit - int((group / "memory.current").read_text()))
+        return min(free, (limit - int((group / "memory.current").read_text())) // sharing)
     except (OSError, ValueError):
         return free

@@ -20,7 +20,7 @@ def needed(trainer: Trainer, seeds: int) -> int:
     Args:
         trainer: of any number of seeds; its schedule, environment and algorithms count.
     """
-    devices = len(jax.devices())
+    devices = len(jax.local_devices())
     each = idle_devices(devices, seeds, trainer.schedule.batch_size) if trainer.on_cpu else 1
     places = min(seeds, devices // each)
     rows = math.ceil(seeds / places) * places
@@ -69,7 +69,8 @@ def most_seeds(trainer: Trainer, budget: int) -> int:
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (middle, high) if needed(trainer, middle) <= budget else (low, middle)
-    return max(low // len(jax.devices()) * len(jax.devices()), min(low, len(jax.devices())))
+    devices = len(jax.local_devices())
+    return max(low // devices * devices, min(low, devices))
 
 
 def fitting_seeds(config: Config, budget: int) -> int:

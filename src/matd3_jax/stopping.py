@@ -3,6 +3,8 @@
 import signal
 import sys
 
+from matd3_jax.distributed import Processes
+
 
 class Stop:
     """SIGINT and SIGTERM end the run after the chunk at work; a second one ends it at once."""
@@ -11,6 +13,11 @@ class Stop:
         self.signal: signal.Signals | None = None
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._remember)
+
+    def agreed(self, processes: Processes) -> signal.Signals | None:
+        """The signal that has come to any of the processes, if any has; all get the same answer."""
+        number = processes.agree(int(self.signal or 0))
+        return signal.Signals(number) if number else None
 
     def _remember(self, number: int, frame: object) -> None:
         if self.signal is not None:

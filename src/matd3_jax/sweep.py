@@ -8,8 +8,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from matd3_jax import command, config, devices, jobs, ranking, search_space, sweep_figure
+from hydra.core.override_parser.types import Override
+
+from matd3_jax import cluster, command, config, devices, distributed, jobs, ranking, search_space, sweep_figure
 from matd3_jax.config import Config
+from matd3_jax.distributed import ALONE, Processes
 from matd3_jax.errors import UserError
 from matd3_jax.search_space import SearchSpace
 from matd3_jax.sweeping import Sweep
@@ -24,10 +27,12 @@ come from intervals: algo.lr='interval(1e-4,1e-2)' (log scale where both ends ar
 options:
   samples=N        draw N settings at random (sample_seed=0 says which)
   metric=COLUMN    of the metrics table, by which settings are ranked (return_agents)
-  memory=GB        that may be used at once; default: what is free
+  memory=GB        that may be used at once (by each process, of several); default: what is free
   train=false      only plan, and say how to train the pieces
   launcher=NAME    train the pieces as jobs of a Hydra launcher, e.g. submitit_slurm; launcher.KEY=value: its options
   name=, out=      the sweep's directory, out/name
+
+{processes}
 
 It ends with a ranked table, table.csv, seeds.csv and sweep.png in its directory; every run is a run directory in runs/,
 for matd3_jax.evaluate, matd3_jax.render and the others."""
@@ -47,12 +52,20 @@ OPTIONS: dict[str, Any] = {
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit code."""
     if {"-h", "--help"} & set(argv):
-        print(HELP)
+        print(HELP.format(processes=cluster.HELP))
         return 0
     devices.prepare()
+    given, argv = config.take_text(argv, cluster.KEYS)
     parsed = config.parse(argv, sweep=True)
-    if any(override.key_or_group == "resume" for override in parsed):
-        return resume(argv)
+    with distributed.start(given) as processes:
+        processes.check_same(" ".join(argv), "settings")
+        if any(override.key_or_group == "resume" for override in parsed):
+            return resume(argv, processes)
+        return start(argv, parsed, processes)
+
+
+def start(argv: Sequence[str], parsed: Sequence[Override], processes: Processes) -> int:
+    """A fresh sweep."""
     launcher = [text for text, o in zip(argv, parsed, strict=True) if o.key_or_group.startswith("launcher.")]
     plain = ("launcher", *OPTIONS)
     mine = [text for text, o in zip(argv, parsed, strict=True) if o.key_or_group in plain]
@@ -62,31 +75,52 @@ def main(argv: Sequence[str]) -> int:
     if launcher and options["launcher"] is None:
         raise UserError(f"{launcher[0]}: say which launcher, e.g. launcher=submitit_slurm")
     if options["launcher"] is not None:
+        if processes.size > 1:
+            raise UserError(
+                f"launcher={options['launcher']} starts processes itself: call it from one, not from {processes.size}"
+            )
         jobs.check(options["launcher"], launcher)
     chosen, settings = read(rest, options["samples"], options["sample_seed"])
     folder = Path(str(options["out"])) / str(options["name"] or f"sweep-{time.strftime('%Y%m%d-%H%M%S')}")
+    if processes.first:
+        _plan(folder, argv, options, dict(zip(settings, chosen, strict=True)), settings, processes)
+    folder = processes.same_directory(folder)
+    sweep, facts = open_sweep(folder, processes)
+    if options["launcher"] is not None:
+        code = jobs.launch(folder, len(sweep.pieces), str(options["launcher"]), launcher)
+        return code or _report_if_finished(sweep, None, facts)
+    if not options["train"]:
+        if processes.first:
+            print(f"train a piece with: python -m matd3_jax.sweep resume={folder} piece=K "
+                  f"(0 to {len(sweep.pieces) - 1})\n"
+                  f"then rank with: python -m matd3_jax.sweep resume={folder}")  # fmt: skip
+        return 0
+    return _train(sweep, None, facts)
+
+
+def _plan(
+    folder: Path,
+    argv: Sequence[str],
+    options: Mapping[str, Any],
+    chosen: Mapping[str, Mapping[str, str]],
+    settings: Mapping[str, Config],
+    processes: Processes,
+) -> None:
+    """Make the sweep's directory, and say what is in it."""
     if folder.exists():
         raise UserError(f"{folder} is there already: choose another name=, or go on with resume={folder}")
-    sweep = Sweep(folder)
+    sweep = Sweep(folder, processes)
     budget = None if options["memory"] is None else int(options["memory"] * 1e9)
     runs = sweep.add(settings, budget)
     facts = {
         "command": shlex.join(["python", "-m", "matd3_jax.sweep", *argv]),
         "metric": options["metric"],
-        "settings": dict(zip(settings, chosen, strict=True)),
+        "settings": chosen,
         "runs": {name: [path.name for path in paths] for name, paths in runs.items()},
     }
     (folder / "sweep.json").write_text(json.dumps(facts, indent=1) + "\n")
     seeds = sum(c.seeds for c in settings.values())
     print(f"sweep directory: {folder}\n{len(settings)} settings, {seeds} seeds, {len(sweep.pieces)} pieces", flush=True)
-    if options["launcher"] is not None:
-        code = jobs.launch(folder, len(sweep.pieces), str(options["launcher"]), launcher)
-        return code or _report_if_finished(sweep, None, facts)
-    if not options["train"]:
-        print(f"train a piece with: python -m matd3_jax.sweep resume={folder} piece=K (0 to {len(sweep.pieces) - 1})\n"
-              f"then rank with: python -m matd3_jax.sweep resume={folder}")  # fmt: skip
-        return 0
-    return _train(sweep, None, facts)
 
 
 def read(overrides: Sequence[str], samples: int | None, seed: int) -> tuple[list[dict[str, str]], dict[str, Config]]:
@@ -104,32 +138,33 @@ def read(overrides: Sequence[str], samples: int | None, seed: int) -> tuple[list
     return chosen, settings
 
 
-def resume(argv: Sequence[str]) -> int:
+def resume(argv: Sequence[str], processes: Processes) -> int:
     """Go on with a sweep: all pieces that are not finished, or one, then the table."""
     taken, rest = config.take(argv, ("resume", "piece", "metric"))
     if rest:
         raise UserError(f"cannot take {rest[0]!r} with resume=: a sweep keeps its settings")
-    sweep, facts = open_sweep(Path(str(taken["resume"])))
+    sweep, facts = open_sweep(Path(str(taken["resume"])), processes)
     piece = taken.get("piece")
     if piece is not None and (type(piece) is not int or not 0 <= piece < len(sweep.pieces)):
         raise UserError(f"piece={piece!r}: {sweep.folder} has the pieces 0 to {len(sweep.pieces) - 1}")
     return _train(sweep, piece, {**facts, "metric": taken.get("metric", facts["metric"])})
 
 
-def open_sweep(folder: Path) -> tuple[Sweep, dict[str, Any]]:
+def open_sweep(folder: Path, processes: Processes = ALONE) -> tuple[Sweep, dict[str, Any]]:
     """A sweep and its facts (command, metric, settings). Raises UserError if there is none."""
     try:
-        return Sweep(folder), json.loads((folder / "sweep.json").read_text())
+        return Sweep(folder, processes), json.loads((folder / "sweep.json").read_text())
     except (OSError, ValueError):
         raise UserError(f"{folder} is no sweep directory: it has no sweep.json") from None
 
 
 def _train(sweep: Sweep, piece: int | None, facts: Mapping[str, Any]) -> int:
     code = sweep.train(None if piece is None else [piece])
+    if not sweep.processes.first:
+        return sweep.processes.tell()
     if code:
         print(f"stopped; go on with: python -m matd3_jax.sweep resume={sweep.folder}")
-        return code
-    return _report_if_finished(sweep, piece, facts)
+    return sweep.processes.tell(code or _report_if_finished(sweep, piece, facts))
 
 
 def _report_if_finished(sweep: Sweep, piece: int | None, facts: Mapping[str, Any]) -> int:

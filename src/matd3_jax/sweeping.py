@@ -17,6 +17,7 @@ import numpy as np
 
 from matd3_jax import checkpoint, devices, outcome, overestimation, plan, plotting
 from matd3_jax.config import Config
+from matd3_jax.distributed import ALONE, Processes
 from matd3_jax.errors import UserError
 from matd3_jax.memory import fitting_seeds, needed
 from matd3_jax.progress import ProgressBar
@@ -27,10 +28,15 @@ from matd3_jax.training import Row, Training
 
 
 class Sweep:
-    """The runs of a folder and their pieces."""
+    """The runs of a folder and their pieces.
 
-    def __init__(self, folder: Path):
-        self.folder = folder
+    Args:
+        processes: which train every piece together, its seeds shared out among them (among as many as there are
+            seeds); the first of them plans, and writes all but the others' part of checkpoints.
+    """
+
+    def __init__(self, folder: Path, processes: Processes = ALONE):
+        self.folder, self.processes = folder, processes
         self.runs = folder / "runs"
         self._plan = folder / "pieces.json"
 
@@ -44,13 +50,14 @@ class Sweep:
         among them.
 
         Args:
-            budget: bytes that a piece may take; None: what is free now.
+            budget: bytes that a piece may take in each process; None: what is free now.
 
         Raises UserError where a setting is impossible, or one seed of it does not fit.
         """
-        budget = devices.free_memory() if budget is None else budget
+        budget = devices.free_memory(self.processes.here) if budget is None else budget
+        size = self.processes.size
         existing = plan.existing_runs(self.runs)
-        new = plan.pieces(settings, existing, self.runs, lambda config: fitting_seeds(config, budget))
+        new = plan.pieces(settings, existing, self.runs, lambda config: size * fitting_seeds(config, budget))
         machine = {"versions": devices.versions(), **devices.description()}
         for config in (config for piece in new for config in piece):
             RunDirectory.create(self.runs / str(config.name), config, machine)
@@ -73,25 +80,34 @@ class Sweep:
         """
         stop = Stop()
         todo = [k for k in range(len(self.pieces)) if not self.finished(k) and (only is None or k in only)]
-        for k in todo:
+        for k in self.processes.tell(todo):
             with self._taken(k) as mine:
-                if not mine:
-                    print(f"piece {k}: another process is at it, passed over", flush=True)
-                elif not self.finished(k):
-                    Piece(self, k).train(stop)
-            if stop.signal is not None:
-                return 128 + stop.signal
+                if self.processes.tell(mine and not self.finished(k)):
+                    together = self.processes.part(sum(member.seeds for member in self.members(k)))
+                    if together is not None:
+                        Piece(self, k, together).train(stop)
+                stopped = stop.agreed(self.processes)
+            if stopped is not None:
+                return 128 + stopped
         return 0
+
+    def members(self, piece: int) -> list[Config]:
+        """Settings of the runs in a piece."""
+        return [RunDirectory.open(self.runs / name)[1] for name in self.pieces[piece]]
 
     @contextlib.contextmanager
     def _taken(self, piece: int) -> Iterator[bool]:
-        """Whether this process has the piece to itself now."""
+        """Whether these processes have the piece to themselves now; the first takes it for all."""
+        if not self.processes.first:
+            yield False
+            return
         place = self.folder / "pieces" / str(piece)
         place.mkdir(parents=True, exist_ok=True)
         with (place / "lock").open("w") as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
+                print(f"piece {piece}: another process is at it, passed over", flush=True)
                 yield False
                 return
             yield True
@@ -100,14 +116,13 @@ class Sweep:
 
 
 class Piece:
-    """Runs side by side in one program."""
+    """Runs side by side in one program, in one process or several."""
 
-    def __init__(self, sweep: Sweep, number: int):
-        self.sweep, self.number = sweep, number
-        opened = [RunDirectory.open(sweep.runs / name) for name in sweep.pieces[number]]
-        self.runs = [run for run, _ in opened]
-        self.members = [config for _, config in opened]
-        self.training = Training(self.members[0], members=self.members)
+    def __init__(self, sweep: Sweep, number: int, processes: Processes = ALONE):
+        self.sweep, self.number, self.processes = sweep, number, processes
+        self.runs = [RunDirectory(sweep.runs / name) for name in sweep.pieces[number]]
+        self.members = sweep.members(number)
+        self.training = Training(self.members[0], members=self.members, processes=processes)
         self.checkpoints = sweep.folder / "pieces" / str(number) / "checkpoints"
         ends = np.cumsum([config.seeds for config in self.members])
         self.seeds = [slice(end - config.seeds, end) for end, config in zip(ends.tolist(), self.members, strict=True)]
@@ -117,39 +132,53 @@ class Piece:
         """From the last checkpoint, or from the start, to the end or until a signal comes."""
         training, settings, begun = self.training, self.members[0], time.monotonic()
         training.check_memory()
-        self._announce()
+        if self.processes.first:
+            self._announce()
         state, row = self._begin()
         step = saved = int(row["step"][0])
         every = training.total_steps / 5 if settings.checkpoint_every is None else settings.checkpoint_every
-        progress = ProgressBar(training.total_steps, len(training.seeds), row)
+        progress = ProgressBar(training.total_steps, training.share.total, row) if self.processes.first else None
+
+        def save() -> None:
+            checkpoint.save(self.checkpoints, step, training.trainer, state, keep=1, share=training.share)
+
         try:
-            while step < training.total_steps and stop.signal is None:
+            stopped = stop.agreed(self.processes)
+            while step < training.total_steps and stopped is None:
                 state, row = training.advance(state)
                 step = int(row["step"][0])
-                self._append(row)
-                progress.show(row)
+                if progress is not None:
+                    self._append(row)
+                    progress.show(row)
                 if every and step - saved >= every and step < training.total_steps:
-                    checkpoint.save(self.checkpoints, step, training.trainer, state, keep=1)
+                    save()
                     saved = step
+                stopped = stop.agreed(self.processes)
         finally:
-            progress.stop()
+            if progress is not None:
+                progress.stop()
         if step < training.total_steps:
-            checkpoint.save(self.checkpoints, step, training.trainer, state, keep=1)
+            save()
             return
-        self._finish(state, row, {"seconds": round(time.monotonic() - begun, 1), **progress.rates()})
+        rates = {} if progress is None else progress.rates()
+        self._finish(state, row, {"seconds": round(time.monotonic() - begun, 1), **rates})
 
     def _begin(self) -> tuple[TrainState, Row]:
-        if not checkpoint.steps(self.checkpoints):
-            for run in self.runs:
+        first, tell = self.processes.first, self.processes.tell
+        if not tell(bool(checkpoint.steps(self.checkpoints)) if first else None):
+            for run in self.runs if first else ():
                 run.clear()
             state, row = self.training.start()
-            self._append(row)
+            if first:
+                self._append(row)
             return state, row
-        saved = checkpoint.verify(self.checkpoints)
-        state, done = checkpoint.restore(saved, self.training.trainer), int(saved.name)
-        for run in self.runs:
+        saved = Path(tell(str(checkpoint.verify(self.checkpoints)) if first else None))
+        state, done = checkpoint.restore(saved, self.training.trainer, self.training.share), int(saved.name)
+        self.processes.barrier()
+        for run in self.runs if first else ():
             run.cut(done)
-        print(f"going on from the checkpoint of env step {done:,}", flush=True)
+        if first:
+            print(f"going on from the checkpoint of env step {done:,}", flush=True)
         updates = self.training.trainer.updates(int(state.collects))
         return state, {"step": np.array([done]), "updates": np.array([updates])}
 
@@ -159,9 +188,12 @@ class Piece:
 
     def _finish(self, state: TrainState, row: Row, facts: Mapping[str, Any]) -> None:
         """Leave each run as if it had been trained alone, but for its replay."""
-        facts = {**facts, "side_by_side": len(self.training.seeds)}
+        trainer, share = self.training.trainer, self.training.share
+        facts = {**facts, "side_by_side": share.total}
         for run, config, seeds in zip(self.runs, self.members, self.seeds, strict=True):
-            checkpoint.save(run.checkpoints, int(row["step"][0]), self.training.trainer, state, keep=1, seeds=seeds)
+            checkpoint.save(run.checkpoints, int(row["step"][0]), trainer, state, keep=1, seeds=seeds, share=share)
+            if not self.processes.first:
+                continue
             metrics = run.read_metrics()
             plotting.learning_curve(run.curve, metrics, str(config.name))
             summary = outcome.summary(metrics, {n: values[seeds] for n, values in row.items()}, **facts)
@@ -172,13 +204,14 @@ class Piece:
 
     def _announce(self) -> None:
         training, config = self.training, self.members[0]
-        seeds, mesh = len(training.seeds), training.trainer.mesh
+        seeds, mesh, size = training.share.total, training.trainer.mesh, self.processes.size
+        several = f" in each of {size} processes" if size > 1 else ""
         names = [str(member.name) for member in self.members]
         shown = ", ".join(names if len(names) <= 4 else [*names[:2], "...", names[-1]])
         print(f"piece {self.number} ({self.number + 1} of {len(self.sweep.pieces)}): {len(names)} runs, {seeds} seeds "
-              f"in all, on {mesh.size} x {mesh.devices.flat[0].device_kind}: {shown}")  # fmt: skip
+              f"in all, on {mesh.size} x {mesh.devices.flat[0].device_kind}{several}: {shown}")  # fmt: skip
         print(f"{config.env['name']}, {training.total_steps:,} env steps each; {training.memory}; "
-              f"{needed(training.trainer, seeds) / 1e9:.2f} GB in all", flush=True)  # fmt: skip
+              f"{needed(training.trainer, len(training.seeds)) / 1e9:.2f} GB in all", flush=True)  # fmt: skip
 
 
 class Stopped(Exception):

@@ -9,15 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from matd3_jax import checkpoint, command, config, devices, outcome, overestimation, plotting
+from matd3_jax import checkpoint, cluster, command, config, devices, distributed, outcome, overestimation, plotting
 from matd3_jax import training as training_module
 from matd3_jax.config import Config
+from matd3_jax.distributed import Processes
 from matd3_jax.errors import UserError
 from matd3_jax.progress import ProgressBar
 from matd3_jax.runs import RunDirectory
 from matd3_jax.stopping import Stop
 from matd3_jax.trainer import TrainState
-from matd3_jax.training import Training
+from matd3_jax.training import Row, Training
 
 HELP = """usage: python -m matd3_jax.train [env=NAME] [algo=NAME] [adversary=NAME] [schedule=wide] [key=value ...]
        python -m matd3_jax.train resume=RUN_DIR [checkpoint=STEP] [total_steps=N]
@@ -25,6 +26,8 @@ HELP = """usage: python -m matd3_jax.train [env=NAME] [algo=NAME] [adversary=NAM
 
 environments: {envs}
 algorithms:   {algos}
+
+{processes}
 
 settings and their defaults (those of a file: env.KEY=value, algo.KEY=value, adversary.KEY=value); robots bring others
 along, which --cfg env=ant prints:
@@ -37,36 +40,42 @@ def main(argv: Sequence[str]) -> int:
     if {"-h", "--help"} & set(argv):
         settings = (Path(__file__).parent / "conf" / "config.yaml").read_text()
         names = {"envs": ", ".join(config.known_names("env")), "algos": ", ".join(config.known_names("algo"))}
-        print(HELP.format(settings=settings.split("\n\n", 2)[2], **names))
+        print(HELP.format(settings=settings.split("\n\n", 2)[2], processes=cluster.HELP, **names))
         return 0
     if "--cfg" in argv:
         print(config.text(config.load([a for a in argv if a != "--cfg"])), end="")
         return 0
     devices.prepare()
+    given, argv = config.take_text(argv, cluster.KEYS)
     taken, overrides = config.take(argv, ("resume", "checkpoint"))
-    if taken.get("resume") is not None:
-        return resume(Path(str(taken["resume"])), taken.get("checkpoint"), overrides)
-    if taken.get("checkpoint") is not None:
-        raise UserError("checkpoint= goes with resume=RUN_DIR")
-    return start(config.load(overrides))
+    with distributed.start(given) as processes:
+        processes.check_same(" ".join(argv), "settings")
+        if taken.get("resume") is not None:
+            return resume(Path(str(taken["resume"])), taken.get("checkpoint"), overrides, processes)
+        if taken.get("checkpoint") is not None:
+            raise UserError("checkpoint= goes with resume=RUN_DIR")
+        return start(config.load(overrides), processes)
 
 
-def start(settings: Config) -> int:
+def start(settings: Config, processes: Processes) -> int:
     """A fresh run."""
-    training = Training(settings)
+    training = Training(settings, processes=processes)
     training.check_memory()
     _tensorboard_writer(settings, None)
     path = Path(settings.out) / (settings.name or _name(settings))
-    machine = {"versions": devices.versions(), **devices.description()}
-    run = RunDirectory.create(path, settings, machine)
-    _announce(training, run)
+    machine = {"versions": devices.versions(), **processes.description()}
+    if processes.first:
+        run = RunDirectory.create(path, settings, machine)
+        _announce(training, run)
+    run = RunDirectory(processes.same_directory(path))
     stop = Stop()
     state, row = training.start()
-    run.append(row)
+    if processes.first:
+        run.append(row)
     return _advance(training, run, state, row, stop)
 
 
-def resume(path: Path, step: Any, overrides: Sequence[str]) -> int:
+def resume(path: Path, step: Any, overrides: Sequence[str], processes: Processes) -> int:
     """Go on with a run from a checkpoint."""
     changed, rest = config.take(overrides, ("total_steps",))
     if rest:
@@ -75,56 +84,64 @@ def resume(path: Path, step: Any, overrides: Sequence[str]) -> int:
         raise UserError(f"checkpoint={step!r}: must be the env step of a checkpoint")
     run, settings = RunDirectory.open(path)
     settings = config.from_dict({**settings.to_dict(), **changed})
-    training = Training(settings)
-    saved = checkpoint.verify(run.checkpoints, step)
+    training = Training(settings, processes=processes)
+    saved = Path(processes.tell(str(checkpoint.verify(run.checkpoints, step)) if processes.first else None))
     done = int(saved.name)
     if done >= training.total_steps:
         raise UserError(f"{path} is at env step {done:,} of {training.total_steps:,}: to go on, raise total_steps=")
     training.check_memory()
     _tensorboard_writer(settings, None)
-    _announce(training, run)
-    print(f"going on from the checkpoint of env step {done:,}", flush=True)
+    if processes.first:
+        _announce(training, run)
+        print(f"going on from the checkpoint of env step {done:,}", flush=True)
     stop = Stop()
-    state = checkpoint.restore(saved, training.trainer)
-    config.write(settings, run.path / "config.yaml")
-    run.cut(done)
+    state = checkpoint.restore(saved, training.trainer, training.share)
+    processes.barrier()  # the files are changed only when all have what they need
+    if processes.first:
+        config.write(settings, run.path / "config.yaml")
+        run.cut(done)
     row = {"step": np.array([done]), "updates": np.array([training.trainer.updates(int(state.collects))])}
     return _advance(training, run, state, row, stop)
 
 
-def _advance(training: Training, run: RunDirectory, state: TrainState, row: dict[str, np.ndarray], stop: Stop) -> int:
-    """Chunk after chunk to the end, or until a signal comes."""
-    settings, begun = training.config, time.monotonic()
-    step = int(row["step"][0])
-    progress = ProgressBar(training.total_steps, settings.seeds, row)
-    writer = _tensorboard_writer(settings, run)
+def _advance(training: Training, run: RunDirectory, state: TrainState, row: Row, stop: Stop) -> int:
+    """Chunk after chunk to the end, or until a signal comes. Of several processes the first alone tells of the run, in
+    files and on the terminal."""
+    settings, processes, begun = training.config, training.processes, time.monotonic()
+    step = saved = int(row["step"][0])
+    report = Report(training, run, row) if processes.first else None
     every = training.total_steps / 5 if settings.checkpoint_every is None else settings.checkpoint_every
-    saved = step
+
+    def save() -> None:
+        keep = settings.keep_checkpoints
+        checkpoint.save(run.checkpoints, step, training.trainer, state, keep, share=training.share)
+
     try:
-        while step < training.total_steps and stop.signal is None:
+        stopped = stop.agreed(processes)
+        while step < training.total_steps and stopped is None:
             state, row = training.advance(state)
             step = int(row["step"][0])
-            run.append(row)
-            progress.show(row)
-            if writer is not None:
-                _to_tensorboard(writer, row)
+            if report is not None:
+                report.add(row)
             if every and step - saved >= every and step < training.total_steps:
-                checkpoint.save(run.checkpoints, step, training.trainer, state, settings.keep_checkpoints)
+                save()
                 saved = step
+            stopped = stop.agreed(processes)
     finally:
-        progress.stop()
-        if writer is not None:
-            writer.close()
-    checkpoint.save(run.checkpoints, step, training.trainer, state, settings.keep_checkpoints)
+        if report is not None:
+            report.close()
+    save()
+    if report is None:
+        return 128 + stopped if stopped is not None and step < training.total_steps else 0
     metrics = run.read_metrics()
     plotting.learning_curve(run.curve, metrics, _title(training))
     if settings.diagnostics.q_bias:
         overestimation.draw(run.q_bias, metrics, training.spec.by_team(), _title(training))
-    if stop.signal is not None and step < training.total_steps:
-        print(f"stopped by {stop.signal.name} at env step {step:,}; go on with: "
+    if stopped is not None and step < training.total_steps:
+        print(f"stopped by {stopped.name} at env step {step:,}; go on with: "
               f"python -m matd3_jax.train resume={run.path}")  # fmt: skip
-        return 128 + stop.signal
-    summary = outcome.summary(metrics, row, seconds=round(time.monotonic() - begun, 1), **progress.rates())
+        return 128 + stopped
+    summary = outcome.summary(metrics, row, seconds=round(time.monotonic() - begun, 1), **report.progress.rates())
     over = f"(95 % interval over {settings.seeds} seeds)"
     for team, final in summary["last_tenth"].items():
         print(f"mean training return of {team} over the last tenth: {outcome.text(final, over)}")
@@ -145,9 +162,10 @@ def _advance(training: Training, run: RunDirectory, state: TrainState, row: dict
 def _announce(training: Training, run: RunDirectory) -> None:
     settings, trainer = training.config, training.trainer
     kinds = ", ".join(dict.fromkeys(device.device_kind for device in trainer.mesh.devices.flat))
+    several = f" in each of {training.processes.size} processes" if training.processes.size > 1 else ""
     print(f"run directory: {run.path}")
     print(f"{_title(training)}, seeds {settings.seed} to {settings.seed + settings.seeds - 1}, "
-          f"{training.total_steps:,} env steps each, on {trainer.mesh.size} x {kinds}")  # fmt: skip
+          f"{training.total_steps:,} env steps each, on {trainer.mesh.size} x {kinds}{several}")  # fmt: skip
     print(f"schedule: {settings.num_envs} x {settings.rollout_length} env steps, then {settings.updates_per_collect} "
           f"updates with {settings.batch_size} transitions")  # fmt: skip
     print(training.memory, flush=True)
@@ -167,6 +185,26 @@ def _name(settings: Config) -> str:
     return f"{settings.env['name']}-{settings.algo.name}{against}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
+class Report:
+    """What a run tells while it goes: rows of the metrics table, progress, TensorBoard files where asked for."""
+
+    def __init__(self, training: Training, run: RunDirectory, row: Row):
+        self.run, self.progress = run, ProgressBar(training.total_steps, training.config.seeds, row)
+        self.writer = _tensorboard_writer(training.config, run)
+
+    def add(self, row: Row) -> None:
+        """One more chunk."""
+        self.run.append(row)
+        self.progress.show(row)
+        if self.writer is not None:
+            _to_tensorboard(self.writer, row)
+
+    def close(self) -> None:
+        self.progress.stop()
+        if self.writer is not None:
+            self.writer.close()
+
+
 def _tensorboard_writer(settings: Config, run: RunDirectory | None) -> Any:
     """A writer if asked for; with run None only the check that there can be one. Raises UserError."""
     if not settings.tensorboard:
@@ -178,7 +216,7 @@ def _tensorboard_writer(settings: Config, run: RunDirectory | None) -> Any:
     return None if run is None else SummaryWriter(str(run.tensorboard))
 
 
-def _to_tensorboard(writer: Any, row: dict[str, np.ndarray]) -> None:
+def _to_tensorboard(writer: Any, row: Row) -> None:
     for name, values in row.items():
         if name not in ("step", "seed") and not np.isnan(values).all():
             for seed, value in zip(row["seed"], values, strict=True):

@@ -13,6 +13,7 @@ from matd3_jax import config as configuration
 from matd3_jax import devices, envs, overestimation
 from matd3_jax.algorithms import HyperParams
 from matd3_jax.config import Config
+from matd3_jax.distributed import ALONE, Processes
 from matd3_jax.envs.base import Environment
 from matd3_jax.envs.joint import JointTeam
 from matd3_jax.errors import UserError
@@ -49,14 +50,25 @@ class Training:
         env: the environment; default: the one that `config.env` names.
         members: settings of the runs side by side, which may differ in `HyperParams`, `seed` and `seeds` only; default
             `config` alone. Wherever an axis [seeds] is, the seeds of the first come first.
+        processes: which train them together, each its share of the seeds on its own devices. States have the seeds of
+            this process alone; rows of the metrics table those of all processes in the first of them.
 
-    Raises UserError where the environment does not take its options, or a team has no agents.
+    Raises UserError where the environment does not take its options, a team has no agents, or a process no seed.
     """
 
-    def __init__(self, config: Config, env: Environment | None = None, members: Sequence[Config] | None = None):
-        self.config = config
+    def __init__(
+        self,
+        config: Config,
+        env: Environment | None = None,
+        members: Sequence[Config] | None = None,
+        processes: Processes = ALONE,
+    ):
+        self.config, self.processes = config, processes
         self.members = (config,) if members is None else tuple(members)
-        self.seeds = np.concatenate([np.arange(m.seed, m.seed + m.seeds) for m in self.members])
+        numbers = np.concatenate([np.arange(m.seed, m.seed + m.seeds) for m in self.members])
+        self.share = processes.share(len(numbers))
+        """Which of the seeds are trained in this process."""
+        self.seeds = numbers[self.share.seeds]
         """[seeds] the number that each seed's key is made from."""
         base = envs.make(**config.env) if env is None else env
         teams = config.teams()
@@ -80,7 +92,8 @@ class Training:
         )
         hyper = {team: self._hyper(team) for team in teams}
         seeds, normalise = len(self.seeds), config.normalise_observations
-        trainer = Trainer(self.env, self.spec, schedule, hyper, seeds, normalise_observations=normalise)
+        local = jax.local_devices()
+        trainer = Trainer(self.env, self.spec, schedule, hyper, seeds, local, normalise_observations=normalise)
         # Whole chunks of equal length, so that one compiled program does for all; as many as come closest to log_every.
         cycles = max(1, math.ceil((config.total_steps - trainer.prefill_steps) / trainer.cycle_steps))
         wanted = max(1, round((config.log_every or config.total_steps / 100) / trainer.cycle_steps))
@@ -93,12 +106,12 @@ class Training:
         schedule = dataclasses.replace(schedule, replay_capacity=capacity)
         kept = config.diagnostics.q_bias_rollouts if config.diagnostics.q_bias else 0
         self.trainer = Trainer(
-            self.env, self.spec, schedule, hyper, seeds, normalise_observations=normalise, q_bias_pairs=kept
+            self.env, self.spec, schedule, hyper, seeds, local, normalise_observations=normalise, q_bias_pairs=kept
         )
 
     def _hyper(self, team: str) -> HyperParams:
         """The team's hyper-parameters, leaves [seeds]."""
-        each = [m.teams()[team].hyper_params() for m in self.members for _ in range(m.seeds)]
+        each = [m.teams()[team].hyper_params() for m in self.members for _ in range(m.seeds)][self.share.seeds]
         return jax.tree.map(lambda *leaves: np.array(leaves, np.float32), *each)
 
     # ---- memory ------------------------------------------------------------------------------------------------------
@@ -108,15 +121,16 @@ class Training:
         """The arithmetic of the replay's memory."""
         t, s = self.trainer, self.spec
         copies = f"{t.devices_per_seed} copies x " if t.devices_per_seed > 1 else ""
+        whose = f" of process {self.processes.index}" if self.processes.size > 1 else ""
         return (
-            f"replay: {t.rows} seeds x {copies}{t.schedule.replay_capacity:,} transitions x {s.row_size} numbers "
+            f"replay{whose}: {t.rows} seeds x {copies}{t.schedule.replay_capacity:,} transitions x {s.row_size} numbers "
             f"x 4 bytes = {t.replay_bytes / 1e9:.2f} GB (x {s.observation_size}, actions {s.action_size}, "
             f"rewards {s.num_agents}, {'more 1, ' if s.n_step > 1 else ''}x' {s.observation_size}, discount 1)"
         )
 
     def check_memory(self) -> None:
         """Raise UserError, with the arithmetic, if the replay cannot fit."""
-        free = devices.free_memory()
+        free = devices.free_memory(self.processes.here)
         if self.trainer.replay_bytes > free:
             raise UserError(
                 f"{self.memory}, but only {free / 1e9:.2f} GB are free: fewer seeds, or replay_capacity at most "
@@ -130,13 +144,13 @@ class Training:
         return jax.vmap(jax.random.key)(self.seeds)
 
     def start(self) -> tuple[TrainState, Row]:
-        """The state after the prefill, and what the untrained policies got there."""
+        """The state after the prefill, and what the untrained policies got there (of all processes in the first)."""
         self.check_memory()
         state, episodes = self.trainer.prefill(self.trainer.init(self.keys()))
         row = self.row(state, Metrics(episodes, None))  # type: ignore[arg-type]
         row |= self.evaluation_columns(state)
         state, columns = self.q_bias(state, due=True)
-        return state, row | columns
+        return state, self.processes.gather(row | columns)
 
     @cached_property
     def chunk(self) -> Program:
@@ -144,14 +158,15 @@ class Training:
         return self.trainer.chunk(self.cycles_per_chunk)
 
     def advance(self, state: TrainState) -> tuple[TrainState, Row]:
-        """One chunk, and an evaluation where one is due. The state given in is donated."""
+        """One chunk, and an evaluation where one is due; the row has the seeds of all processes in the first of them.
+        The state given in is donated."""
         before = self.step(state)
         state, metrics = self.chunk(state)
         step, every = self.step(state), self.eval_every
         due = every > 0 and (step // every > before // every or step >= self.total_steps)
         row = self.row(state, metrics) | self.evaluation_columns(state if due else None)
         state, columns = self.q_bias(state, due)
-        return state, row | columns
+        return state, self.processes.gather(row | columns)
 
     def step(self, state: TrainState) -> int:
         """Env steps of each seed so far."""
