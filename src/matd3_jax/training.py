@@ -123,8 +123,8 @@ class Training:
         copies = f"{t.devices_per_seed} copies x " if t.devices_per_seed > 1 else ""
         whose = f" of process {self.processes.index}" if self.processes.size > 1 else ""
         return (
-            f"replay{whose}: {t.rows} seeds x {copies}{t.schedule.replay_capacity:,} transitions x {s.row_size} numbers "
-            f"x 4 bytes = {t.replay_bytes / 1e9:.2f} GB (x {s.observation_size}, actions {s.action_size}, "
+            f"replay{whose}: {t.rows} seeds x {copies}{t.schedule.replay_capacity:,} transitions x {s.row_size} "
+            f"numbers x 4 bytes = {t.replay_bytes / 1e9:.2f} GB (x {s.observation_size}, actions {s.action_size}, "
             f"rewards {s.num_agents}, {'more 1, ' if s.n_step > 1 else ''}x' {s.observation_size}, discount 1)"
         )
 
