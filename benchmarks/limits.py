@@ -233,14 +233,19 @@ def compiled_flops(trainer: Trainer) -> float:
 # ---- measured --------------------------------------------------------------------------------------------------------
 
 
-@functools.cache
 def seconds(product: Product, count: int, repeats: int = 5) -> float:
-    """Seconds of one product on each of `count` devices at the same time, median. Operands come one after the other
-    from a set of eight, so that they are no warmer in cache than what the loop has just computed."""
-    found = jax.devices()[:count]
-    mesh = jax.sharding.Mesh(np.array(found), ("devices",))
+    """Seconds of one product on each of `count` devices at the same time, median."""
+    call, times = _repeated(product, count)
+    return _median(call, repeats) / times
+
+
+@functools.cache
+def _repeated(product: Product, count: int) -> tuple[Callable[[], Any], int]:
+    """What does a product many times on each of `count` devices, and how many times. Operands come one after the other
+    from a set of eight (fewer where they are large), so that they are no warmer in cache than in the loop."""
+    mesh = jax.sharding.Mesh(np.array(jax.devices()[:count]), ("devices",))
     spec = jax.sharding.PartitionSpec("devices")
-    sets = 8
+    sets = max(1, min(8, 2**26 // (math.prod(product.left) + math.prod(product.right))))
     rounds = max(1, round(0.02 * 50e9 / (product.flops * sets)))
 
     def rounds_of(left, right):
@@ -256,7 +261,9 @@ def seconds(product: Product, count: int, repeats: int = 5) -> float:
         jax.device_put(np.full((count, sets, *shape), 0.01, np.float32), jax.sharding.NamedSharding(mesh, spec))
         for shape in (product.left, product.right)
     )
-    return _median(lambda: program(left, right), repeats) / (rounds * sets)
+    call = functools.partial(program, left, right)
+    jax.block_until_ready(call())
+    return call, rounds * sets
 
 
 @functools.cache

@@ -8,9 +8,9 @@ Other keys are settings of the run, as `python -m matd3_jax.train` takes them. E
 and is the median of `repeats` stretches of about a second, with the slowest and the fastest beside it. Parts:
 "environment" steps the environments with the same action again and again, "rollout" adds the policies and the write
 into the replay, "replay" gathers the minibatches, "update" is all that learning does, gathering included. The env
-steps/s of a part are those of a loop in which everything else is free. The floor is the time that the matrix products
-of a part alone take on these devices, measured in the same run (`benchmarks.limits`): "of floor" is the share of a
-part's time that this would be.
+steps/s of a part are those of a loop in which everything else is free. The floor is the time that the matrix
+products of a part alone take on these devices, measured just before and after (`benchmarks.limits`): "of floor" is the share of
+a part's time that this would be.
 """
 
 import json
@@ -97,6 +97,7 @@ def measure(
                 calls = max(1, round(wanted_calls))
                 break
             cycles = max(2, round(cycles * wanted_calls))
+        least = [_floor(trainer, part)]
         times = []
         for _ in range(repeats):
             begun = time.perf_counter()
@@ -105,7 +106,7 @@ def measure(
             jax.block_until_ready(state)
             times.append((time.perf_counter() - begun) / calls)
         cycles = program.cycles
-        least = limits.floor(trainer, part=part)[0].seconds if part in ("rollout", "update", "loop") else 0.0
+        least.append(_floor(trainer, part))
         steps = seeds * cycles * trainer.cycle_steps
         updates = seeds * cycles * trainer.cycle_collects * trainer.schedule.updates_per_collect
         rows.append(
@@ -116,11 +117,16 @@ def measure(
                 "slowest": steps / max(times),
                 "fastest": steps / min(times),
                 "updates_per_second": updates / float(np.median(times)) if part in ("update", "loop") else 0.0,
-                "of_floor": least * cycles / float(np.median(times)),
+                "of_floor": float(np.mean(least)) * cycles / float(np.median(times)),
                 "compile_seconds": compile_seconds,
             }
         )
     return rows
+
+
+def _floor(trainer: Trainer, part: str) -> float:
+    """Least seconds of a cycle's part; 0 where there are no products in it."""
+    return limits.floor(trainer, 3, part)[0].seconds if part in ("rollout", "update", "loop") else 0.0
 
 
 def parts(trainer: Trainer) -> dict[str, Callable[[TrainState, Any], Any]]:
