@@ -9,8 +9,8 @@ and is the median of `repeats` stretches of about a second, with the slowest and
 "environment" steps the environments with the same action again and again, "rollout" adds the policies and the write
 into the replay, "replay" gathers the minibatches, "update" is all that learning does, gathering included. The env
 steps/s of a part are those of a loop in which everything else is free. The floor is the time that the matrix
-products of a part alone take on these devices, measured just before and after (`benchmarks.limits`): "of floor" is the share of
-a part's time that this would be.
+products of a part alone take on these devices, measured just before and after (`benchmarks.limits`): "of floor" is
+the share of a part's time that this would be.
 """
 
 import json

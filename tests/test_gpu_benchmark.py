@@ -107,16 +107,15 @@ def test_targets(tmp_path):
             }
         },
         "floor": {
-            "update of simple_spread": {"flops": 1e9, "bytes": 1e8},
-            "products, 20 seeds, default": {"flops_per_second": 2e13},
-            "bandwidth": {"bytes_per_second": 2e12},
+            "20 seeds": {"products_seconds": 1e-3, "bytes_seconds": 5e-4, "flops": 2e10},
+            "1024 seeds": {"products_seconds": 7.0, "bytes_seconds": 7.0, "flops": 7.0},
         },
         "ant": {"loop, exact, 20": {"seeds": 1, "num_envs": 20, "seconds_for_all": 60.0}},
     }
     text = "\n".join(targets.lines(report))
     assert "(20 seeds): 400,000; target 1,000,000: MISSED" in text
     assert "takes 10.00 ms, 2.00 of them with a kernel running (1500 kernels, 3 copies); the rest, 80%" in text
-    assert "1.00 ms of products" in text and "1.00 ms of memory traffic" in text
+    assert "1.00 ms of products" in text and "(20 TFLOP/s), 0.50 ms of memory traffic" in text
     assert "(20 environments): 1.0 min\n" in text
 
 

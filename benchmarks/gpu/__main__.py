@@ -5,7 +5,7 @@
 Parts, in this order; docs/performance.md says what each takes:
     check       one update against the CPU's, single Ant steps against C MuJoCo, no copy of the replay in the loop
     wall_clock  20 seeds x 60,000 episodes of simple_spread, and their returns beside the CPU's
-    floor       rates of products and of memory
+    floor       the least time of a cycle: its products and bytes at the device's own rates
     launches    kernels of a cycle, and the share of the time in which none runs
     seeds       env steps/s over 1 to 1,024 seeds: whole loop, update, rollout
     precision   float32 products beside the device's own (TF32), wall_clock too
@@ -31,7 +31,7 @@ from matd3_jax.errors import UserError
 PARTS: dict[str, Callable[[Report, float, Length], None]] = {
     "check": lambda report, scale, length: checks.run(report),
     "wall_clock": lambda report, scale, length: wall_clock.run(report, scale),
-    "floor": lambda report, scale, length: floor.run(report, scale, length.seconds),
+    "floor": lambda report, scale, length: floor.run(report, scale),
     "launches": launches.run,
     "seeds": seeds.run,
     "precision": variants.precision,
