@@ -48,7 +48,8 @@ def main(argv: Sequence[str]) -> int:
     }
     for key in ("machine", "versions", "commit", "gflops"):
         print(f"{key}: {report[key]}")
-    print(f"{'environments':>12} {'part':<12} {'env steps/s':>12} {'slowest':>10} {'fastest':>10} {'of floor':>8}", flush=True)
+    print(f"{'environments':>12} {'part':<12} {'env steps/s':>12} {'slowest':>10} {'fastest':>10} "
+          f"{'of floor':>8}", flush=True)  # fmt: skip
     for n in counts:
         parts = None if options["loops"] else ("environment",)
         settings = [f"env={options['env']}", *schedule(n), *overrides]
@@ -56,7 +57,8 @@ def main(argv: Sequence[str]) -> int:
         for row in rows:
             report["rows"].append({"num_envs": n, **row})
             print(f"{n:>12} {row['part']:<12} {row['env_steps_per_second']:>12,.0f} {row['slowest']:>10,.0f} "
-                  f"{row['fastest']:>10,.0f} {row['of_floor']:>8.1%}   compiled in {row['compile_seconds']:.0f} s", flush=True)  # fmt: skip
+                  f"{row['fastest']:>10,.0f} {row['of_floor']:>8.1%}"
+                  f"   compiled in {row['compile_seconds']:.0f} s", flush=True)  # fmt: skip
     if options["out"] is not None:
         Path(options["out"]).write_text(json.dumps(report, indent=1) + "\n")
     return 0
