@@ -182,7 +182,9 @@ class Trainer:
 
     def init(self, keys: chex.PRNGKey) -> TrainState:
         """The state of fresh runs, one for each of `keys` [num_seeds]. The replay is allocated here."""
-        state = self._init(self.fill(keys))
+        # Compiler options are for whole programs, not for what is traced into another one.
+        init = self._init if isinstance(keys, jax.core.Tracer) else self._compiled_init
+        state = init(self.fill(keys))
         capacity = self.schedule.replay_capacity
         allocate = partial(replay.allocate, self.rows, capacity, self.spec.row_size)
         return state._replace(replay=jax.jit(allocate, out_shardings=self.shardings.replay)())
@@ -210,10 +212,13 @@ class Trainer:
             spread = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (keys.shape[0], *leaf.shape)), fresh)
             return state._replace(statistics=spread)
 
+        return self._sharded(init, P("seeds"), self._specs)
+
+    @cached_property
+    def _compiled_init(self) -> Callable:
         # Run once, and a tenth of the time to compile; the numbers are the same to the bit.
         quick = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-        options = quick if self.on_cpu else None
-        return jax.jit(self._sharded(init, P("seeds"), self._specs), compiler_options=options)
+        return jax.jit(self._init, compiler_options=quick if self.on_cpu else None)
 
     @property
     def _specs(self) -> TrainState:
