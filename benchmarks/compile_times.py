@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import fresh
-from benchmarks.throughput import commit
+from benchmarks.commit import commit
 from matd3_jax import command, config, devices
 from matd3_jax.envs.base import nearest
 from matd3_jax.errors import UserError

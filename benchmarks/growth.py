@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import fresh, growth_figure
-from benchmarks.throughput import commit
+from benchmarks.commit import commit
 from matd3_jax import command, config, devices
 from matd3_jax.errors import UserError
 

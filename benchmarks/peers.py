@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import throughput
+from benchmarks.commit import commit
 from benchmarks.peers_scripts import process, rows
 from benchmarks.peers_scripts.process import Process, WorkerError
 from benchmarks.peers_scripts.rows import WORKERS, Row, Variant
@@ -48,7 +49,7 @@ def main(argv: Sequence[str]) -> int:
     report: dict[str, Any] = {
         "machine": devices.description(),
         "versions": devices.versions(),
-        "commit": throughput.commit(),
+        "commit": commit(),
         "settings": [word for word in argv if not word.startswith("envs=")],  # where, not what
         "gflops_before": throughput.matmul_gflops(),
     }

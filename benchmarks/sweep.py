@@ -19,7 +19,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks.throughput import commit
+from benchmarks.commit import commit
 from matd3_jax import command, config, devices, plan, sweep
 from matd3_jax.config import Config
 from matd3_jax.search_space import SearchSpace

@@ -49,9 +49,9 @@ class Metrics(NamedTuple):
 
 
 def idle_devices(devices: int, seeds: int, batch_size: int) -> int:
-    """How many devices each seed can have where there are fewer seeds than devices: as many as there are for it and
-    divide the minibatch; 1 where there are not."""
-    return max(n for n in range(1, max(1, devices // seeds) + 1) if batch_size % n == 0)
+    """How many devices each seed can have where there are fewer seeds than devices: two, if there are two for it and
+    they divide the minibatch, else one. More than two were not measured, and each has the seed's whole replay."""
+    return 2 if devices >= 2 * seeds and batch_size % 2 == 0 else 1
 
 
 class Trainer:
@@ -62,8 +62,8 @@ class Trainer:
         hyper: for each team its `HyperParams`, every leaf a number or an array [seeds].
         devices: where the seeds are spread out; default all devices.
         devices_per_seed: how many of the devices share the work of one seed, each with an equal part of every
-            minibatch (the networks are the same on all, and so is the replay). Default on CPU: as many as would have
-            no seed otherwise and divide the minibatch; elsewhere 1.
+            minibatch (the networks are the same on all, and so is the replay). Default on CPU:
+            `idle_devices`; elsewhere 1.
         piece: how many of a device's seeds are updated together; default 1 on CPU (a seed's batch stays in cache) and
             all of them elsewhere.
         normalise_observations: networks see observations in units of their running mean and standard deviation; the
