@@ -6,8 +6,8 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from .engine import Physical
 from .partition import Layout, Split, lay_out
-from .quietly import mjx
 from .robot import Robot, uniform
 
 
@@ -30,7 +30,7 @@ class Ant(Robot):
     robot = "ant"
     file = "ant.xml"
     frame_skip = 5
-    senses_contacts = True
+    reads = ("xpos", "cfrc_ext")
 
     @property
     def layout(self) -> Layout:
@@ -47,11 +47,11 @@ class Ant(Robot):
         (forces,) = sensed
         return speed, jnp.ones(()), -0.5 * jnp.sum(control**2), -5e-4 * jnp.sum(forces**2)
 
-    def sense(self, data: mjx.Data) -> tuple[chex.Array, ...]:
-        return (jnp.clip(data._impl.cfrc_ext, -1, 1),)
+    def sense(self, physical: Physical) -> tuple[chex.Array, ...]:
+        return (jnp.clip(physical.fields["cfrc_ext"], -1, 1),)
 
     def start(self, qpos: chex.Array, qvel: chex.Array) -> tuple[tuple[chex.Array, ...], chex.Array]:
         return (jnp.zeros((14, 6), qpos.dtype),), qpos[0]
 
-    def progress(self, data: mjx.Data) -> chex.Array:
-        return data.xpos[1, 0]  # the torso's, of the integrator's last stage: what gymnasium reads
+    def progress(self, physical: Physical) -> chex.Array:
+        return physical.fields["xpos"][1, 0]  # the torso's, of the integrator's last stage: what gymnasium reads

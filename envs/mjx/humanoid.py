@@ -6,8 +6,8 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from .engine import Physical
 from .partition import Layout, Split, lay_out
-from .quietly import mjx
 from .robot import Robot, uniform
 
 
@@ -15,7 +15,7 @@ from .robot import Robot, uniform
 class Humanoid(Robot):
     """Humanoid-v5 (Tassa et al. 2012); 0.015 s an env step, controls in [-0.4, 0.4].
 
-    gymnasium's model asks for MuJoCo's PGS solver, which MJX lacks: here Newton's method solves the same problem (see
+    gymnasium's model asks for MuJoCo's PGS solver, which MJX lacks: there Newton's method solves the same problem (see
     docs/environments.md for the difference).
 
     Full observation [348]: qpos[2:] (22), qvel (23), of 13 bodies inertia about the centre of mass (130) and velocity
@@ -32,7 +32,7 @@ class Humanoid(Robot):
     file = "humanoid.xml"
     frame_skip = 5
     forward_weight = 1.25
-    senses_contacts = True
+    reads = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext", "xipos")
 
     @property
     def layout(self) -> Layout:
@@ -51,13 +51,14 @@ class Humanoid(Robot):
         contact = jnp.minimum(5e-7 * jnp.sum(forces**2), 10)
         return self.forward_weight * speed, 5.0 * healthy, -0.1 * jnp.sum(control**2), -contact
 
-    def sense(self, data: mjx.Data) -> tuple[chex.Array, ...]:
-        return data._impl.cinert[1:], data.cvel[1:], data.qfrc_actuator[6:], data._impl.cfrc_ext[1:]
+    def sense(self, physical: Physical) -> tuple[chex.Array, ...]:
+        found = physical.fields
+        return found["cinert"][1:], found["cvel"][1:], found["qfrc_actuator"][6:], found["cfrc_ext"][1:]
 
     def start(self, qpos: chex.Array, qvel: chex.Array) -> tuple[tuple[chex.Array, ...], chex.Array]:
-        data = self._physics.place(qpos, qvel)
-        return self.sense(data), self.progress(data)
+        physical = self._engine.place(qpos, qvel, self.reads)
+        return self.sense(physical), self.progress(physical)
 
-    def progress(self, data: mjx.Data) -> chex.Array:
+    def progress(self, physical: Physical) -> chex.Array:
         mass = jnp.asarray(self.mj_model.body_mass, jnp.float32)
-        return jnp.dot(mass / mass.sum(), data.xipos[:, 0], precision="highest")
+        return jnp.dot(mass / mass.sum(), physical.fields["xipos"][:, 0], precision="highest")

@@ -1,4 +1,4 @@
-"""What all MJX robots share: physics, the split among agents, resets, the time limit, and broken states."""
+"""What all robots share: the engine, the split among agents, resets, the time limit, and broken states."""
 
 import abc
 import dataclasses
@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from ..base import LIMIT, Box, Environment, TimeStep, check_choice, check_count
-from . import simulation
+from ..base import LIMIT, Box, Environment, TimeStep, check_count
+from . import engine
+from .engine import Engine, Physical
 from .partition import Layout, Partition, Split, as_split, describe, partition
-from .quietly import mjx
 
 TERMS = ("forward", "survive", "ctrl", "contact")
 """Parts of the rewards."""
@@ -41,11 +41,12 @@ class RobotState(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Robot(Environment):
-    """A robot of gymnasium's in MJX, its joints shared out among agents that all get the same reward.
+    """A robot of gymnasium's, its joints shared out among agents that all get the same reward.
 
-    Options: `physics` "exact" or "fast" (`simulation.load`), `split` and `depth` (`partition.partition`),
-    `episode_length` in env steps. Actions are controls in the model's range. A state that blows up (an entry not finite
-    or beyond `base.LIMIT`) terminates the episode with reward 0.
+    Options: `physics`, the engine (`engine.resolve`): "c" (C MuJoCo on the host), "mjx" (MJX, within float32's rounding
+    of C), "mjx_fast" (MJX with brax's settings), or "auto", which the instance resolves; `split` and `depth`
+    (`partition.partition`), `episode_length` in env steps. Actions are controls in the model's range. A state that
+    blows up (an entry not finite or beyond `base.LIMIT`) terminates the episode with reward 0.
 
     `measures`, means over env steps: forward_velocity (m/s), and the parts of the reward (reward_forward,
     reward_survive, reward_ctrl, reward_contact).
@@ -53,7 +54,7 @@ class Robot(Environment):
     Raises OptionError for impossible options.
     """
 
-    physics: str = "exact"
+    physics: str = "auto"
     split: Split = "single"
     depth: int | None = None
     episode_length: int = 1000  # type: ignore[misc]  # a field in place of the property
@@ -65,10 +66,11 @@ class Robot(Environment):
     frame_skip: ClassVar[int]
     """Simulation steps of one env step."""
     forward_weight: ClassVar[float] = 1.0
-    senses_contacts: ClassVar[bool] = False
+    reads: ClassVar[tuple[str, ...]] = ()
+    """Fields of MuJoCo's data that `sense` and `progress` need."""
 
     def __post_init__(self) -> None:
-        check_choice("physics", self.physics, simulation.KINDS)
+        object.__setattr__(self, "physics", engine.resolve(self.physics))
         check_count("episode_length", self.episode_length, 1)
         object.__setattr__(self, "split", as_split(self.split))
         self.partition  # noqa: B018  # raises for impossible splits
@@ -92,7 +94,7 @@ class Robot(Environment):
     def rewards(self, speed: chex.Array, control: chex.Array, sensed: tuple, healthy: chex.Array) -> tuple:
         """The parts of the reward (`TERMS`), of the speed along x (m/s) and the controls [nu]."""
 
-    def sense(self, data: mjx.Data) -> tuple[chex.Array, ...]:
+    def sense(self, physical: Physical) -> tuple[chex.Array, ...]:
         """`RobotState.sensed` after an env step."""
         return ()
 
@@ -100,9 +102,9 @@ class Robot(Environment):
         """`RobotState.sensed` and `progress` at a reset."""
         return (), qpos[0]
 
-    def progress(self, data: mjx.Data) -> chex.Array:
+    def progress(self, physical: Physical) -> chex.Array:
         """`RobotState.progress` after an env step."""
-        return data.qpos[0]
+        return physical.qpos[0]
 
     # ---- the contract ------------------------------------------------------------------------------------------------
 
@@ -149,15 +151,16 @@ class Robot(Environment):
         """All agents act once; nothing here is random, `key` is not used."""
         del key
         control = self.control(action)
-        data = self._physics.advance(
-            state.qpos, state.qvel, state.qacc_warmstart, control, self.frame_skip, self.senses_contacts
+        physical = self._engine.advance(
+            state.qpos, state.qvel, state.qacc_warmstart, control, self.frame_skip, self.reads
         )
-        sound = (jnp.abs(data.qpos) < LIMIT).all() & (jnp.abs(data.qvel) < LIMIT).all()  # false for NaN, too
-        healthy = sound & self.healthy(data.qpos, data.qvel)
-        sensed, progress = self.sense(data), self.progress(data)
+        qpos, qvel = physical.qpos, physical.qvel
+        sound = (jnp.abs(qpos) < LIMIT).all() & (jnp.abs(qvel) < LIMIT).all()  # false for NaN, too
+        healthy = sound & self.healthy(qpos, qvel)
+        sensed, progress = self.sense(physical), self.progress(physical)
         speed = (progress - state.progress) / (self.frame_skip * self.mj_model.opt.timestep)
         terms = jnp.where(sound, jnp.stack(self.rewards(speed, control, sensed, healthy)), 0)
-        after = RobotState(data.qpos, data.qvel, data.qacc_warmstart, sensed, progress, terms, state.step + 1)
+        after = RobotState(qpos, qvel, physical.qacc_warmstart, sensed, progress, terms, state.step + 1)
         return TimeStep(
             state=after,
             observation=self.observe(after),
@@ -198,7 +201,7 @@ class Robot(Environment):
     @property
     def mj_model(self) -> mujoco.MjModel:
         """The robot's model in C MuJoCo."""
-        return self._physics.mj_model
+        return self._engine.mj_model
 
     @property
     def agent_bodies(self) -> tuple[tuple[int, ...], ...]:
@@ -210,8 +213,8 @@ class Robot(Environment):
         return state.qpos
 
     @property
-    def _physics(self) -> simulation.Physics:
-        return simulation.load(self.file, self.physics)
+    def _engine(self) -> Engine:
+        return engine.load(self.file, self.physics)
 
 
 def uniform(key: chex.PRNGKey, size: int, scale: float) -> chex.Array:

@@ -25,6 +25,9 @@ class Algorithm:
     """Gradient clipping by the norm of each variable on its own, of each network, or not at all."""
     adam: Literal["standard", "epsilon_hat"] = "standard"
     """"epsilon_hat": epsilon outside the bias correction, as TensorFlow 1 has it."""
+    actor_output: Literal["sigmoid", "tanh"] = "sigmoid"
+    """How a Box action follows from an actor's output u: low + (high - low) sigmoid(u), or centre + half range tanh(u),
+    which is the sigmoid of 2u: twice the slope."""
     smoothing: bool = False
     """Add clipped Gaussian noise to the targets' actions (target policy smoothing)."""
     sync_targets: bool = True

@@ -17,13 +17,14 @@ from omegaconf.errors import OmegaConfBaseException
 
 from matd3_jax import cluster, devices
 from matd3_jax.algorithms import Algorithm, HyperParams
-from matd3_jax.envs.base import nearest
+from matd3_jax.envs.base import OptionError, nearest
 from matd3_jax.errors import UserError
 from matd3_jax.typed import plain, typed
 from matd3_jax.validation import check
 
 ADDED_LATER = {"eval_every": 0, "eval_episodes": 10, "n_step": 1, "normalise_observations": False,
-               "diagnostics": {"q_bias": False, "q_bias_rollouts": 200, "q_bias_steps": 100}}  # fmt: skip
+               "diagnostics": {"q_bias": False, "q_bias_rollouts": 200, "q_bias_steps": 100},
+               "algo": {"actor_output": "sigmoid"}, "adversary": {"actor_output": "sigmoid"}}  # fmt: skip
 """Keys that runs from before them lack, with the values that those runs had in effect; a group may lack some, too."""
 
 GROUPS = ("env", "algo", "adversary", "schedule")
@@ -57,6 +58,7 @@ class AlgoConfig:
     exploration_noise: float
     sync_targets: bool
     adam: str
+    actor_output: str
 
     def algorithm(self) -> Algorithm:
         """What fixes the shape of the learner."""
@@ -164,6 +166,7 @@ def load(overrides: Sequence[str] = ()) -> Config:
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(_one_line(error)) from error
     assert isinstance(resolved, dict)
+    resolved["env"] = _with_engine(resolved["env"])
     for key in (
         "resume",
         "checkpoint",
@@ -248,7 +251,11 @@ def read(path: Path) -> Config:
     try:
         found = OmegaConf.to_container(OmegaConf.load(path))
         assert isinstance(found, dict)
-        return from_dict(_with_defaults(found, ADDED_LATER))
+        values = _with_defaults(found, ADDED_LATER)
+        if "physics" in values["env"]:
+            physics = values["env"]["physics"]
+            values["env"] = {**values["env"], "physics": {"exact": "mjx", "fast": "mjx_fast"}.get(physics, physics)}
+        return from_dict(values)
     except (OSError, AssertionError, ValueError, OmegaConfBaseException) as error:
         raise UserError(f"cannot read the configuration {path}: {_one_line(error)}") from error
 
@@ -279,6 +286,19 @@ def from_dict(values: Mapping[str, Any]) -> Config:
     config = typed(Config, {**rest, **groups}, "")
     check(config)
     return config
+
+
+def _with_engine(env: Mapping[str, Any]) -> Mapping[str, Any]:
+    """A robot's options with the engine that this machine takes for `physics: auto`: a run keeps it wherever it is
+    resumed."""
+    if "physics" not in env:
+        return env
+    from matd3_jax.envs.mjx import engine  # MuJoCo, which particle tasks do not need
+
+    try:
+        return {**env, "physics": engine.resolve(env["physics"])}
+    except OptionError as error:
+        raise UserError(f"env.{error}") from error
 
 
 def _with_defaults(found: Mapping[Any, Any], defaults: Mapping[str, Any]) -> dict[Any, Any]:

@@ -249,7 +249,7 @@ def _update_agent(
 
     def actor_loss(params):
         output = apply(actor, params, batch.observation)
-        action = networks.act(space, output, noise.action)
+        action = networks.act(space, output, noise.action, squash=algorithm.actor_output)
         q1 = apply(first, q1_params, batch.inputs, action - batch.action, batch.action_column)
         loss = -q1.mean() + hyper.logit_regulariser * jnp.mean(jnp.square(output))
         return loss, loss
@@ -294,7 +294,8 @@ def _target_actions(
     parts = []
     for j, (other, params, network) in enumerate(others):
         space = other.action_space
-        part = networks.act(space, apply(network, params, batch.next_observations[j]), noise.target[j])
+        output, squash = apply(network, params, batch.next_observations[j]), other.algorithm.actor_output
+        part = networks.act(space, output, noise.target[j], squash=squash)
         if noise.smoothing[j] is not None:
             part = networks.smooth(space, part, noise.smoothing[j], hyper.target_noise, hyper.target_noise_clip)
         parts.append(part)

@@ -91,21 +91,31 @@ def policy_noise(key: chex.PRNGKey, space: ActionSpace, shape: tuple[int, ...]) 
     return None if isinstance(space, Box) else noise(key, space, shape)
 
 
-def act(space: ActionSpace, output: chex.Array, draw: chex.Array | None, scale: chex.Array | float = 0.0) -> chex.Array:
+def act(
+    space: ActionSpace,
+    output: chex.Array,
+    draw: chex.Array | None,
+    scale: chex.Array | float = 0.0,
+    squash: str = "sigmoid",
+) -> chex.Array:
     """Action vectors [..., space.size] from actor outputs [..., space.size].
 
     Choices: softmax(logits + Gumbel noise) at temperature 1 for each part, soft as it is for a `Simplex`; one-hot with
-    the soft sample's gradient (straight-through) for hard choices. Box: low + (high - low) sigmoid(output), plus
-    `scale` half ranges of Gaussian noise, kept inside the Box.
+    the soft sample's gradient (straight-through) for hard choices. Box: the squashed output, plus `scale` half ranges
+    of Gaussian noise, kept inside the Box.
 
     Args:
         draw: noise as from `noise`; None for the deterministic action (no noise: softmax(logits), the likeliest
             choice, or the squashed output).
         scale: standard deviation of the Gaussian noise in half ranges; only for a Box.
+        squash: `Algorithm.actor_output`; only for a Box.
     """
     if isinstance(space, Box):
         half = (space.high - space.low) / 2
-        action = space.low + 2 * half * jax.nn.sigmoid(output)
+        if squash == "tanh":
+            action = space.low + half + half * jnp.tanh(output)
+        else:
+            action = space.low + 2 * half * jax.nn.sigmoid(output)
         if draw is None:
             return action
         return jnp.clip(action + scale * half * draw, space.low, space.high)

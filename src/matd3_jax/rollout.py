@@ -195,7 +195,8 @@ def act(
         stacked = jnp.stack([observation[i] for i in group.members])
         output = learner.apply(learner.actor_of(group), policy.actors[g], stacked)
         draw = None if draws is None else draws[g]
-        parts.append(networks.act(group.action_space, output, draw, policy.hyper[g].exploration_noise))
+        scale, squash = policy.hyper[g].exploration_noise, group.algorithm.actor_output
+        parts.append(networks.act(group.action_space, output, draw, scale, squash))
     return spec.join_actions(parts)
 
 

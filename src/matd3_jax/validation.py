@@ -12,6 +12,7 @@ CHOICES = {
     "critic": ("central", "own"),
     "clip": ("variable", "network", "none"),
     "adam": ("standard", "epsilon_hat"),
+    "actor_output": ("sigmoid", "tanh"),
     "update_order": ("simultaneous", "sequential"),
     "warmup": ("policy", "random"),
 }
