@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from .base import OptionError
 from .mjx.partition import KinematicTree, Layout, describe, lay_out
-from .quiet import quiet, quiet_compiler
+from .quiet import quiet, quiet_mujoco
 
 BACKENDS = ("spring", "positional", "generalized")
 
@@ -76,7 +76,7 @@ def calling() -> Iterator[None]:
 @functools.cache
 def load(robot: str, backend: str) -> Any:
     """brax's environment. Its arrays are made outside whatever is being traced: they outlive it."""
-    with quiet(), quiet_compiler(), jax.ensure_compile_time_eval():
+    with quiet(), quiet_mujoco(), jax.ensure_compile_time_eval():
         return import_brax().get_environment(FACTS[robot].brax_name, backend=backend)
 
 
@@ -86,7 +86,7 @@ def mj_model(robot: str) -> Any:
     import mujoco
 
     assets = importlib.resources.files("brax.envs") / "assets"
-    with quiet_compiler():
+    with quiet_mujoco():
         return mujoco.MjModel.from_xml_path(str(assets / f"{robot}.xml"))
 
 

@@ -2,8 +2,9 @@
 
 import contextlib
 import io
+import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 
 @contextlib.contextmanager
@@ -18,13 +19,30 @@ def quiet() -> Iterator[None]:
         yield
 
 
+_lock = threading.Lock()
+_inside = 0
+_listener: Callable | None = None
+
+
 @contextlib.contextmanager
-def quiet_compiler() -> Iterator[None]:
-    """No warnings from MuJoCo's model compiler, which prints them and logs them in the working directory."""
+def quiet_mujoco() -> Iterator[None]:
+    """No warnings from MuJoCo, its model compiler included, which prints them and logs them in the working directory.
+
+    MuJoCo has one listener for the whole process: the first thread that comes in takes it away, and the last that goes
+    out puts it back.
+    """
+    global _inside, _listener
     import mujoco
 
-    mujoco.set_mju_user_warning(lambda message: None)
+    with _lock:
+        if _inside == 0:
+            _listener = mujoco.get_mju_user_warning()
+            mujoco.set_mju_user_warning(lambda message: None)
+        _inside += 1
     try:
         yield
     finally:
-        mujoco.set_mju_user_warning(None)
+        with _lock:
+            _inside -= 1
+            if _inside == 0:
+                mujoco.set_mju_user_warning(_listener)

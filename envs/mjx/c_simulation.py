@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 
 from ..base import LIMIT
+from ..quiet import quiet_mujoco
 from .engine import Physical
 from .models import corrected
 
@@ -77,16 +78,19 @@ class CEngine:
         def callback(joined: np.ndarray) -> np.ndarray:
             rows = np.asarray(joined, np.float64).reshape(-1, joined.shape[-1])  # NumPy only: jax#24255
             found = np.full((len(rows), ends[-1]), np.nan)
+            # MuJoCo must not step what is not finite. Accelerations may be large: impacts have them.
+            moderate = (np.abs(rows[:, : model.nq + model.nv]) < LIMIT).all(axis=1)
+            sound = moderate & np.isfinite(rows).all(axis=1)
             data = self.simulators.get()
             try:
                 outputs = [(c, getattr(data, name).reshape(-1)) for c, name in zip(columns, fields, strict=True)]
-                # MuJoCo must not step what is not finite.
-                for row in np.flatnonzero((np.abs(rows) < LIMIT).all(axis=1)):
-                    mujoco.mj_setState(model, data, rows[row], signature)
-                    run(model, data)
-                    mujoco.mj_getState(model, data, found[row, :state_size], STATE)
-                    for column, output in outputs:
-                        found[row, column] = output
+                with quiet_mujoco():  # of robots that blow up, which `Robot.step` ends
+                    for row in np.flatnonzero(sound):
+                        mujoco.mj_setState(model, data, rows[row], signature)
+                        run(model, data)
+                        mujoco.mj_getState(model, data, found[row, :state_size], STATE)
+                        for column, output in outputs:
+                            found[row, column] = output
             finally:
                 self.simulators.put(data)
             with np.errstate(over="ignore"):
@@ -105,14 +109,6 @@ class CEngine:
         return mujoco.MjData(self.mj_model)
 
 
-def silent(data: mujoco.MjData) -> mujoco.MjData:
-    """`data` that does not speak of robots that blow up, which `Robot.step` ends: MuJoCo would print, and write a file
-    where the program runs, at the first warning of each kind."""
-    for warning in data.warning:
-        warning.number = 1
-    return data
-
-
 @functools.cache
 def load(file: str) -> CEngine:
     """C MuJoCo with one of gymnasium's model files ("ant.xml"): its own integrator, solver and iterations; contact
@@ -123,5 +119,5 @@ def load(file: str) -> CEngine:
     simulators: queue.SimpleQueue[mujoco.MjData] = queue.SimpleQueue()
     # Made here, not in the callback, where making MuJoCo's data ended the process (mujoco 3.17.0, jax 0.10.2).
     for _ in range(2 * (os.cpu_count() or 1)):
-        simulators.put(silent(mujoco.MjData(model)))
+        simulators.put(mujoco.MjData(model))
     return CEngine(model, simulators)

@@ -7,7 +7,7 @@ from typing import Any
 import mujoco
 
 from ..base import OptionError
-from ..quiet import quiet, quiet_compiler
+from ..quiet import quiet, quiet_mujoco
 
 CONTACT_POINTS = 8
 """Contacts that MJX keeps of each kind, the deepest first. Robots touch the floor in fewer points at a time, so nothing
@@ -17,7 +17,7 @@ MuJoCo has no such bound."""
 
 def corrected(file: str) -> mujoco.MjModel:
     """gymnasium's model with contact margins as they were before MuJoCo 3.5.0, and `CONTACT_POINTS` for MJX."""
-    with quiet(), quiet_compiler():
+    with quiet(), quiet_mujoco():
         return _corrected(mujoco.MjSpec.from_file(str(assets() / file)), file)
 
 
