@@ -54,7 +54,9 @@ class MjxEngine:
 
 
 def _physical(data: mjx.Data, fields: tuple[str, ...]) -> Physical:
-    found = {name: getattr(data, name) if hasattr(data, name) else getattr(data._impl, name) for name in fields}
+    # Asking the data for what stands in its implementation works, with a warning.
+    own = {field.name for field in dataclasses.fields(data)}
+    found = {name: getattr(data if name in own else data._impl, name) for name in fields}
     return Physical(data.qpos, data.qvel, data.qacc_warmstart, found)
 
 
