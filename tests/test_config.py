@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import jax
 import pytest
 
 from matd3_jax import config, envs
@@ -53,7 +54,11 @@ def test_the_default_schedule_is_the_papers():
 def test_every_environment_has_a_file_that_lists_its_options_and_defaults(name):
     env = dict(config.load([f"env={name}"]).env)
     assert env.pop("name") == name
-    assert env == envs.options(name)
+    defaults = dict(envs.options(name))
+    if "physics" in defaults:
+        assert defaults["physics"] == "auto"
+        defaults["physics"] = "c"  # what a CPU gets; that the file has "auto" is tested below
+    assert env == defaults
 
 
 def test_files_of_algorithms_and_environments_are_all_known():
@@ -93,10 +98,39 @@ def test_written_settings_read_back_the_same(tmp_path):
 def test_settings_of_a_run_from_before_a_key_mean_what_they_meant(tmp_path):
     """Such a run had no evaluations on the way: its table has no columns for them, and must get none on resume."""
     old = config.load(["eval_every=0"])
-    kept = {key: value for key, value in old.to_dict().items() if key not in set(config.ADDED_LATER) - {"algo"}}
+    keys = set(config.ADDED_LATER) - {"algo", "adversary"}
+    kept = {key: value for key, value in old.to_dict().items() if key not in keys}
     kept["algo"] = {key: value for key, value in kept["algo"].items() if key not in config.ADDED_LATER["algo"]}
     (tmp_path / "config.yaml").write_text(json.dumps(kept))  # JSON is YAML
     assert config.read(tmp_path / "config.yaml") == old
+
+
+@pytest.mark.parametrize(
+    ("before", "now"), [("exact", "mjx"), ("fast", "mjx_fast"), ("mjx", "mjx"), ("mjx_fast", "mjx_fast"), ("c", "c")]
+)
+def test_a_run_keeps_its_engine_under_its_new_name(before, now, tmp_path):
+    settings = config.load(["env=hopper", "env.physics=mjx"])
+    old = settings.to_dict()
+    old["env"]["physics"] = before
+    (tmp_path / "config.yaml").write_text(json.dumps(old))
+    found = config.read(tmp_path / "config.yaml")
+    assert found.env["physics"] == now
+    assert found == dataclasses.replace(settings, env={**settings.env, "physics": now})
+
+
+@pytest.mark.parametrize("name", ["ant", "half_cheetah", "hopper", "walker2d", "humanoid", "swimmer"])
+def test_auto_is_resolved_once_for_the_run(name, tmp_path, monkeypatch):
+    settings = config.load([f"env={name}"])
+    assert settings.env["physics"] == "c"
+    config.write(settings, tmp_path / "config.yaml")
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert config.load([f"env={name}"]).env["physics"] == "mjx"
+    assert config.read(tmp_path / "config.yaml").env["physics"] == "c"
+
+
+def test_a_new_run_is_told_the_engines_new_name():
+    with pytest.raises(UserError, match=r"^env\.physics='fast': must be one of .* it is called 'mjx_fast' now$"):
+        config.load(["env=ant", "env.physics=fast"])
 
 
 MISTAKES = {

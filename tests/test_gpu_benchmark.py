@@ -110,7 +110,7 @@ def test_targets(tmp_path):
             "20 seeds": {"products_seconds": 1e-3, "bytes_seconds": 5e-4, "flops": 2e10},
             "1024 seeds": {"products_seconds": 7.0, "bytes_seconds": 7.0, "flops": 7.0},
         },
-        "ant": {"loop, exact, 20": {"seeds": 1, "num_envs": 20, "seconds_for_all": 60.0}},
+        "ant": {"loop, mjx, 20": {"seeds": 1, "num_envs": 20, "seconds_for_all": 60.0}},
     }
     text = "\n".join(targets.lines(report))
     assert "(20 seeds): 400,000; target 1,000,000: MISSED" in text

@@ -12,9 +12,10 @@ pytestmark = pytest.mark.usefixtures("quick_jit")
 SMALL = ("algo.hidden=[16]", "learning_starts=80", "replay_capacity=1000", "env.episode_length=20", "eval_episodes=2")
 
 
-def test_the_ant_trains_and_is_evaluated():
+@pytest.mark.parametrize("physics", ["c", "mjx_fast"])
+def test_the_ant_trains_and_is_evaluated(physics):
     result = matd3_jax.train(
-        *SMALL, "env.physics=fast", env="ant", algo="matd3", schedule="wide",
+        *SMALL, f"env.physics={physics}", env="ant", algo="matd3", num_envs=20, updates_per_collect=2, batch_size=1000,
         seeds=2, total_steps=400, eval_every=200, log_every=200,
     )  # fmt: skip
     table = result.metrics

@@ -9,7 +9,7 @@ Parts, in this order; docs/performance.md says what each takes:
     launches    kernels of a cycle, and the share of the time in which none runs
     seeds       env steps/s over 1 to 1,024 seeds: whole loop, update, rollout
     precision   float32 products beside the device's own (TF32), wall_clock too
-    ant         whole loop of six seeds over environments, its launches, the physics alone, exact and fast
+    ant         whole loop of six seeds over environments, its launches, the physics alone, mjx and mjx_fast
     unroll      longer bodies of the loops
     draws       random number generators, one draw a cycle
     options     command buffers, autotuning

@@ -10,21 +10,21 @@ SEEDS, STEPS = 6, 1_000_000
 
 
 def run(report: Report, scale: float, length: Length) -> None:
-    """What decides about the target comes first: the loop with physics=exact."""
+    """What decides about the target comes first: the loop with physics=mjx."""
     few = length._replace(cycles=min(length.cycles, 5))
     seeds = SEEDS if scale >= 1 else 1
     # 20 environments are the wide schedule, a GPU's default.
     for num_envs in (128, 20, 1024) if scale >= 1 else (20,):
-        report.case("ant", f"loop, exact, {num_envs}", lambda n=num_envs: loop(seeds, n, few))
+        report.case("ant", f"loop, mjx, {num_envs}", lambda n=num_envs: loop(seeds, n, few))
     # The same program as above, hence from the compilation cache.
     report.case("launches", "ant, 20 environments", lambda: launches.measure(settings(20, seeds), few))
-    for physics, counts in (("exact", (128, 1024, 8192)), ("fast", (1024, 8192))):
+    for physics, counts in (("mjx", (128, 1024, 8192)), ("mjx_fast", (1024, 8192))):
         for num_envs in counts if scale >= 1 else (4,):
             name = f"physics, {physics}, {num_envs}"
             report.case("ant", name, lambda p=physics, n=num_envs: physics_alone(p, n, few))
 
 
-def settings(num_envs: int, seeds: int, physics: str = "exact") -> list[str]:
+def settings(num_envs: int, seeds: int, physics: str = "mjx") -> list[str]:
     """100 replayed transitions for each env step, in minibatches of about 1,000."""
     return ["env=ant", f"env.physics={physics}", f"seeds={seeds}", *robots.schedule(num_envs)]
 

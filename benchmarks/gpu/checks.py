@@ -83,7 +83,7 @@ def replay_copies() -> int:
 
 def step_error() -> Row:
     """Largest errors of positions and velocities after single env steps from each recorded state, against C MuJoCo."""
-    env = envs.make("ant", split="single")
+    env = envs.make("ant", physics="mjx", split="single")
     data = [np.load(file) for file in sorted(RECORDED.glob("trajectory_*.npz"))]
 
     def columns(key: str, part: slice) -> jax.Array:

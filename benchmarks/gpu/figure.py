@@ -5,7 +5,7 @@ from experiments import figures
 
 PANELS = {
     "seeds": ("simple_spread", "seeds", ("loop", "update", "rollout")),
-    "ant": ("Ant", "environments of each seed", ("loop, exact", "physics, exact", "physics, fast")),
+    "ant": ("Ant", "environments of each seed", ("loop, mjx", "physics, mjx", "physics, mjx_fast")),
 }
 
 
@@ -19,7 +19,9 @@ def draw(report: Report) -> None:
         title, label, kinds = PANELS[part]
         for kind, colour in zip(kinds, figures.SERIES, strict=False):
             points = sorted(
-                (place(part, row), row["env_steps_per_second"]) for name, row in rows.items() if kind in name
+                (place(part, row), row["env_steps_per_second"])
+                for name, row in rows.items()
+                if f"{kind}," in f"{name},"  # not mjx_fast for mjx
             )
             if points:
                 axis.loglog(*zip(*points, strict=True), "o-", color=colour, label=kind)

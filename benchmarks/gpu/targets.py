@@ -30,7 +30,7 @@ def lines(report: Report) -> list[str]:
     if ants:
         best = min(ants, key=lambda row: row["seconds_for_all"])
         minutes = best["seconds_for_all"] / 60
-        what = f"Ant, exact, {best['seeds']} seeds x 1M env steps ({best['num_envs']} environments)"
+        what = f"Ant, mjx, {best['seeds']} seeds x 1M env steps ({best['num_envs']} environments)"
         full = best["seeds"] >= 6
         found += verdict(what, f"{minutes:.1f} min", minutes <= ANT_MINUTES, f"{ANT_MINUTES:.0f} min", full)
         found += shares(report.get("launches", "ant, 20 environments"))

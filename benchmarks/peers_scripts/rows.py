@@ -69,7 +69,7 @@ def groups(cores: int) -> dict[str, list[Row]]:
         "agilerl": [row for name in ("matd3", "maddpg") for row in _agilerl(name, cores)],
         "jaxmarl": [_jaxmarl(n, steps) for n, steps in ((1, 10_000), (100, 1000), (10_000, 25))],
         "mpe2": _mpe2(),
-        "gymnasium": [row for physics in ("exact", "fast") for row in _ant(physics)],
+        "gymnasium": [row for physics in ("c", "mjx", "mjx_fast") for row in _ant(physics)],
         "rejax": [_rejax(1, 1, 100), _rejax(10, 1, 20), _rejax(1, 128, 256)],
     }
 
