@@ -148,7 +148,7 @@ def test_placing_computes_what_hangs_on_the_state_alone():
 def test_what_was_simulated_before_does_not_matter(file):
     inputs, rng = played(file), np.random.default_rng(1)
     wanted = step(file, inputs)
-    for k in range(2 * (os.cpu_count() or 1)):  # as many as there are simulators
+    for k in range(min(8, 2 * (os.cpu_count() or 1))):  # simulators take turns
         order = rng.permutation(BATCH)
         qpos, qvel, warmstart, control = take(inputs, order)
         if k % 2:  # a third blows up within the step, more or less
