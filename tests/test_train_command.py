@@ -4,6 +4,7 @@ import csv
 import importlib
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -67,6 +68,9 @@ def test_a_run_leaves_all_its_files(whole):
     }  # fmt: skip
     machine = json.loads((whole / "machine.json").read_text())
     assert machine["versions"]["jax"] and machine["devices"]
+    summary = json.loads((whole / "summary.json").read_text())
+    assert summary["training_env_steps_per_second"] > summary["env_steps_per_second"] > 0
+    assert 0 < summary["evaluation_share"] < 1 and summary["updates_per_second"] > 0
     assert (whole / "learning_curve.png").read_bytes()[:4] == b"\x89PNG"
     assert len(checkpoint.steps(whole / "checkpoints")) == 3
 
@@ -110,6 +114,32 @@ def test_evaluations_are_told_of(whole, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "(evaluation" not in printed and "last evaluation" not in printed
     assert "last_evaluation" not in json.loads((tmp_path / "never" / "summary.json").read_text())
+
+
+def test_the_announcement(tmp_path, monkeypatch, capsys):
+    """What a run says before it starts: how long it will take, and for robots alone recipe and engine."""
+    monkeypatch.setattr(train.cost, "product_rate", lambda *_: 1e6)
+    monkeypatch.setattr(train.cost, "physics_rate", lambda *_: None)
+
+    def announced(*settings, done=0, recipe=None):
+        training = train.Training(train.config.load([*settings, "seeds=2", "learning_starts=200"]))
+        object.__setattr__(training.config, "recipe", recipe)
+        train._announce(training, train.RunDirectory(tmp_path / "run"), done)
+        return capsys.readouterr().out.splitlines()
+
+    lines = announced("env=ant", "env.physics=c", "algo=td3", recipe="fast")
+    assert lines[2:4] == ["recipe: fast; for the paper's settings: recipe=paper", "physics: c (C MuJoCo)"]
+    assert lines[-1].startswith("expected: about ") and "hours, compiling apart (products at 0.001 GFLOP/s" in lines[-1]
+    assert announced("env=ant", "env.physics=mjx", recipe="paper")[2:4] == [
+        "recipe: paper",
+        "physics: mjx (MuJoCo in JAX)",
+    ]
+    assert announced("env=brax_ant", recipe="fast")[2].startswith("recipe: fast")
+    plain = announced("env=simple_spread", recipe="paper")
+    assert not any(line.startswith(("recipe", "physics")) for line in plain) and plain[-1].startswith("expected: ")
+    whole, rest = (float(re.search(r"about ([\d,]+) hours", announced("env=simple", done=done)[-1])[1].replace(",", ""))
+                   for done in (0, 1000000))  # fmt: skip
+    assert rest == pytest.approx(whole / 3, rel=0.1)
 
 
 def test_stopped_and_resumed_is_the_same_to_the_bit(whole, tmp_path, monkeypatch, capsys):

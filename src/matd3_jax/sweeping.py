@@ -137,7 +137,7 @@ class Piece:
         state, row = self._begin()
         step = saved = int(row["step"][0])
         every = training.total_steps / 5 if settings.checkpoint_every is None else settings.checkpoint_every
-        progress = ProgressBar(training.total_steps, training.share.total, row) if self.processes.first else None
+        progress = ProgressBar(training, row) if self.processes.first else None
 
         def save() -> None:
             checkpoint.save(self.checkpoints, step, training.trainer, state, keep=1, share=training.share)

@@ -9,7 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from matd3_jax import checkpoint, cluster, command, config, devices, distributed, outcome, overestimation, plotting
+from matd3_jax import (
+    checkpoint,
+    cluster,
+    command,
+    config,
+    cost,
+    devices,
+    distributed,
+    outcome,
+    overestimation,
+    plotting,
+)
 from matd3_jax import training as training_module
 from matd3_jax.config import Config
 from matd3_jax.distributed import Processes
@@ -33,6 +44,10 @@ settings and their defaults (those of a file: env.KEY=value, algo.KEY=value, adv
 along, which --cfg env=ant prints:
 
 {settings}"""
+
+
+ENGINES = {"c": "C MuJoCo", "mjx": "MuJoCo in JAX", "mjx_fast": "MuJoCo in JAX with brax's approximate settings"}
+"""What a robot's `physics` may be."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -92,7 +107,7 @@ def resume(path: Path, step: Any, overrides: Sequence[str], processes: Processes
     training.check_memory()
     _tensorboard_writer(settings, None)
     if processes.first:
-        _announce(training, run)
+        _announce(training, run, done)
         print(f"going on from the checkpoint of env step {done:,}", flush=True)
     stop = Stop()
     state = checkpoint.restore(saved, training.trainer, training.share)
@@ -159,19 +174,36 @@ def _advance(training: Training, run: RunDirectory, state: TrainState, row: Row,
     return 0
 
 
-def _announce(training: Training, run: RunDirectory) -> None:
+def _announce(training: Training, run: RunDirectory, done: int = 0) -> None:
+    """What is going to be trained, from env step `done` on."""
     settings, trainer = training.config, training.trainer
     kinds = ", ".join(dict.fromkeys(device.device_kind for device in trainer.mesh.devices.flat))
     several = f" in each of {training.processes.size} processes" if training.processes.size > 1 else ""
     print(f"run directory: {run.path}")
     print(f"{_title(training)}, seeds {settings.seed} to {settings.seed + settings.seeds - 1}, "
           f"{training.total_steps:,} env steps each, on {trainer.mesh.size} x {kinds}{several}")  # fmt: skip
+    for line in _robot_lines(training):
+        print(line)
     print(f"schedule: {settings.num_envs} x {settings.rollout_length} env steps, then {settings.updates_per_collect} "
           f"updates with {settings.batch_size} transitions")  # fmt: skip
     print(training.memory, flush=True)
+    print(cost.expectation(training, done), flush=True)
     diagnostics = settings.diagnostics
     if diagnostics.q_bias and (note := overestimation.tail_note(trainer.hyper, diagnostics.q_bias_steps)):
         print(f"note: {note}", flush=True)
+
+
+def _robot_lines(training: Training) -> list[str]:
+    """What is chosen for robots alone: the recipe of the settings, and the engine."""
+    lines, recipe = [], getattr(training.config, "recipe", None)
+    if recipe is not None and "forward_velocity" in training.env.measures:
+        other = "" if recipe == "paper" else "; for the paper's settings: recipe=paper"
+        lines.append(f"recipe: {recipe}{other}")
+    physics = getattr(cost.innermost(training.env), "physics", None)
+    if physics is not None:
+        meaning = ENGINES.get(str(physics))
+        lines.append(f"physics: {physics}" + (f" ({meaning})" if meaning else ""))
+    return lines
 
 
 def _title(training: Training) -> str:
@@ -189,7 +221,7 @@ class Report:
     """What a run tells while it goes: rows of the metrics table, progress, TensorBoard files where asked for."""
 
     def __init__(self, training: Training, run: RunDirectory, row: Row):
-        self.run, self.progress = run, ProgressBar(training.total_steps, training.config.seeds, row)
+        self.run, self.progress = run, ProgressBar(training, row)
         self.writer = _tensorboard_writer(training.config, run)
 
     def add(self, row: Row) -> None:

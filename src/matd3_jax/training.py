@@ -1,5 +1,6 @@
 """A run from its settings: what `matd3_jax.train` returns, and what the command advances chunk by chunk."""
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -12,6 +13,7 @@ import numpy as np
 from matd3_jax import config as configuration
 from matd3_jax import devices, envs, overestimation
 from matd3_jax.algorithms import HyperParams
+from matd3_jax.clock import Clock
 from matd3_jax.config import Config
 from matd3_jax.distributed import ALONE, Processes
 from matd3_jax.envs.base import Environment
@@ -66,6 +68,7 @@ class Training:
         self.config, self.processes = config, processes
         self.members = (config,) if members is None else tuple(members)
         numbers = np.concatenate([np.arange(m.seed, m.seed + m.seeds) for m in self.members])
+        self.clock = Clock()
         self.share = processes.share(len(numbers))
         """Which of the seeds are trained in this process."""
         self.seeds = numbers[self.share.seeds]
@@ -148,8 +151,7 @@ class Training:
         self.check_memory()
         state, episodes = self.trainer.prefill(self.trainer.init(self.keys()))
         row = self.row(state, Metrics(episodes, None))  # type: ignore[arg-type]
-        row |= self.evaluation_columns(state)
-        state, columns = self.q_bias(state, due=True)
+        state, columns = self._evaluated(state, due=True)
         return state, self.processes.gather(row | columns)
 
     @cached_property
@@ -161,11 +163,10 @@ class Training:
         """One chunk, and an evaluation where one is due; the row has the seeds of all processes in the first of them.
         The state given in is donated."""
         before = self.step(state)
-        state, metrics = self.chunk(state)
-        step, every = self.step(state), self.eval_every
-        due = every > 0 and (step // every > before // every or step >= self.total_steps)
-        row = self.row(state, metrics) | self.evaluation_columns(state if due else None)
-        state, columns = self.q_bias(state, due)
+        with self.clock.train():
+            state, metrics = jax.block_until_ready(self.chunk(state))
+        row = self.row(state, metrics)
+        state, columns = self._evaluated(state, self._due(before, self.step(state)))
         return state, self.processes.gather(row | columns)
 
     def step(self, state: TrainState) -> int:
@@ -211,6 +212,17 @@ class Training:
         every = self.config.eval_every
         return max(1, self.config.total_steps // 20) if every is None else every
 
+    def _due(self, before: int, step: int) -> bool:
+        """Whether an evaluation ends the chunk from env step `before` to `step`."""
+        every = self.eval_every
+        return every > 0 and (step // every > before // every or step >= self.total_steps)
+
+    def evaluations_after(self, step: int) -> int:
+        """How many evaluations are to come after the chunk that ended at env step `step`."""
+        chunk = self.cycles_per_chunk * self.trainer.cycle_steps
+        ends = range(step, self.total_steps + chunk, chunk)
+        return sum(map(self._due, ends[:-1], ends[1:]))
+
     def evaluate(self, state: TrainState, episodes: int, deterministic: bool, seed: int = 0) -> Evaluation:
         """Whole episodes in float64, leading axis [seeds]; every seed of the run plays from the same start states,
         which `seed` gives."""
@@ -219,6 +231,14 @@ class Training:
         keys = jax.vmap(lambda _: key)(self.seeds)
         found = self.trainer.evaluate(state, keys, episodes, deterministic)
         return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), found)
+
+    def _evaluated(self, state: TrainState, due: bool) -> tuple[TrainState, Row]:
+        """The state as `q_bias` leaves it, and all columns of evaluations: nan where none is due."""
+        jax.block_until_ready(state)  # what is still computed is no evaluation
+        with self.clock.evaluate() if due and self.eval_every else contextlib.nullcontext():
+            row = self.evaluation_columns(state if due else None)
+            state, columns = self.q_bias(state, due)
+        return state, row | columns
 
     def evaluation_columns(self, state: TrainState | None) -> Row:
         """What an evaluation adds to a row: means over `eval_episodes` deterministic episodes, from the same start

@@ -1,0 +1,115 @@
+"""What a run is expected to take: products counted against `benchmarks.limits`, rates, and what is said of them."""
+
+import re
+from types import SimpleNamespace
+
+import jax
+import pytest
+
+from benchmarks import limits
+from matd3_jax import config, cost
+from matd3_jax.training import Training
+
+SMALL = ("total_steps=2000", "replay_capacity=200", "learning_starts=100", "batch_size=16", "seeds=2")
+ANT = ("env=ant", "num_envs=1", "rollout_length=1", "updates_per_collect=1", "algo.hidden=[400,300]")
+WIDE = ("num_envs=20", "rollout_length=1", "updates_per_collect=2", "algo.hidden=[128,128]")
+
+
+def training(*settings, **options):
+    return Training(config.load([*SMALL, *settings]), **options)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ("env=simple_spread",),
+        ("env=simple_spread", "shared_minibatch=true", "algo.hidden=[7,5]"),
+        ("env=simple_tag", "algo=matd3", "adversary=iddpg", "adversary.hidden=[30]", "updates_per_collect=4"),
+        ("env=simple_tag", "algo=maddpg", "adversary=iltd3", "shared_minibatch=true", "algo.policy_delay=2"),
+        (*ANT, "env.split=halves"),
+        ("env=ant", "env.split=4x2", *WIDE),
+        (*ANT, "algo=td3"),
+        ("env=hopper", "env.split=[[thigh_joint],[leg_joint],[foot_joint]]", *WIDE, "algo.policy_delay=4"),
+    ],
+    ids=" ".join,
+)
+def test_products_are_those_of_the_limits(settings):
+    """Counted for one env step of one seed; there, product by product for a whole cycle of a device."""
+    found = training(*settings)
+    trainer, spec, schedule = found.trainer, found.spec, found.trainer.schedule
+    by_part = {
+        part: sum(n * product.flops for product, n in limits.products(trainer, part).items())
+        / (trainer.local_seeds * trainer.cycle_steps)
+        for part in ("rollout", "loop")
+    }
+    assert trainer.devices_per_seed == 1
+    assert cost.acting_flops(spec) == pytest.approx(by_part["rollout"], rel=1e-12)
+    assert cost.step_flops(spec, schedule) == pytest.approx(by_part["loop"], rel=1e-12)
+
+
+def test_one_after_another_each_agent_runs_the_target_actors():
+    """A minibatch for all saves target actors only where all agents learn at once."""
+    once, each, own = (
+        training("env=simple_spread", f"shared_minibatch={shared}", f"update_order={order}")
+        for shared, order in (("true", "simultaneous"), ("true", "sequential"), ("false", "simultaneous"))
+    )
+    flops = [cost.update_flops(t.spec, t.trainer.schedule) for t in (once, each, own)]
+    assert flops[0] < flops[1] == flops[2]
+
+
+def test_a_rate_is_measured():
+    """Larger products are done at a higher rate than tiny ones, and none faster than a core can."""
+    devices = tuple(jax.local_devices())
+    tiny, large = (cost.product_rate(devices, *shape) for shape in ((4, 3, 2), (256, 128, 128)))
+    assert 0 < tiny < large < 1e12 * len(devices)
+
+
+@pytest.mark.parametrize(("name", "physics"), [("ant", "c"), ("hopper", "c"), ("ant", "mjx_fast"), ("ant", "mjx")])
+def test_physics(name, physics):
+    """Measured for C MuJoCo, also behind a joint team; a constant for MJX."""
+    found = training(*ANT, f"env={name}", f"env.physics={physics}", "algo=td3")
+    devices = tuple(jax.local_devices())
+    rate = cost.physics_rate(found.env, devices, 4)
+    assert rate == cost.MJX_STEPS[physics] if physics != "c" else 100 < rate < 1e6
+    assert cost.physics_rate(training("env=simple_spread").env, devices, 4) is None
+
+
+def test_the_expectation_by_hand(monkeypatch):
+    monkeypatch.setattr(cost, "product_rate", lambda *_: 2e9)
+    monkeypatch.setattr(cost, "physics_rate", lambda *_: 5678.0)
+    settings = (*ANT, "total_steps=20000", "learning_starts=10000", "replay_capacity=20000")
+    found = training(*settings, "eval_every=1000", "eval_episodes=3")
+    spec, schedule, total = found.spec, found.trainer.schedule, found.total_steps
+    prefill = found.trainer.prefill_steps
+    assert prefill < 10000 and 20000 <= total < 21000
+    played = total + 12 * 3 * 1000  # evaluations after the prefill and at 10,000, 11,000 ... 20,000
+    flops = played * cost.acting_flops(spec) + (total - prefill) * cost.update_flops(spec, schedule)
+    seconds = 2 * flops / (0.6 * 2e9) + played / 5678  # each of two devices steps one seed
+    assert cost.expectation(found) == (
+        f"expected: about {seconds / 60:.0f} minutes, compiling apart "
+        "(products at 2 GFLOP/s measured on these devices, physics 5,700 env steps/s a core)"
+    )
+    assert 2 < seconds / 60 < 60
+    # Of a run that goes on, what is left.
+    rest = cost.expectation(found, done=prefill + (total - prefill) // 2)
+    minutes = int(re.search(r"about (\d+) minutes", rest)[1])
+    assert minutes < seconds / 60 / 1.5
+
+
+def test_what_is_not_known_is_not_guessed(monkeypatch):
+    found = training("env=simple_spread")
+    assert "own time is not counted" in cost.expectation(found)
+    monkeypatch.setattr(found, "processes", SimpleNamespace(size=2))
+    assert "not estimated for several processes" in cost.expectation(found)
+    monkeypatch.undo()
+    monkeypatch.setattr(found.trainer, "on_cpu", False)
+    assert "not estimated for an accelerator" in cost.expectation(found)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(5, "under a minute"), (61, "about 1 minute"), (1500, "about 25 minutes"), (3300, "about 55 minutes"),
+     (3600, "about 1.0 hours"), (54000, "about 15 hours")],
+)  # fmt: skip
+def test_durations(seconds, text):
+    assert cost.duration(seconds) == text
