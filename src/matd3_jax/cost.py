@@ -143,19 +143,23 @@ def _c_rate(robot: Any, devices: tuple[jax.Device, ...], robots: int) -> float:
 
 
 def _repeated(program: Callable[[int], Any], wanted: float) -> tuple[int, float]:
-    """(how often, seconds) of a program that repeats its work as often as it is told to, for some `wanted` seconds."""
+    """(how often, seconds) of a program that repeats its work as often as it is told to, for some `wanted` seconds.
+
+    In short calls: on a busy machine one that was quick may take a thousand times as long the next time.
+    """
 
     def seconds(count: int) -> float:
         begun = time.perf_counter()
         jax.block_until_ready(program(count))
         return time.perf_counter() - begun
 
-    count = 1
+    count, times, taken = 1, 0, 0.0
     seconds(count)  # compiles
-    while (taken := seconds(count)) < 0.1 * wanted:
+    while seconds(count) < 0.1 * wanted and count < 1000:
         count *= 4
-    count = max(1, round(count * wanted / taken))
-    return count, seconds(count)
+    while taken < wanted:
+        times, taken = times + count, taken + seconds(count)
+    return times, taken
 
 
 # ---- said ------------------------------------------------------------------------------------------------------------
