@@ -126,6 +126,12 @@ CASES = {
         "point_reach", "matd3", changes={"smoothing": True, "num_critics": 3, "clip": "network", "hidden": (6, 4)}
     ),
     "box-own": Case("point_reach", "iltd3", changes={"smoothing": True, "adam": "epsilon_hat"}),
+    # Options of recipes for robots.
+    "tanh": Case(
+        "point_reach", "matd3", changes={"actor_output": "tanh", "smoothing": True, "actor_average": 0.3}, shared=True
+    ),
+    "tanh-own": Case("point_reach", "iltd3", changes={"actor_output": "tanh", "reward_scale": 0.1}, still=("agents",)),
+    "scaled": Case("simple_tag", "matd3", changes={"reward_scale": 3.0, "actor_average": 0.1}, n_step=2),
     "discrete": Case(
         "simple_spread", "maddpg", options={"actions": "discrete"}, changes={"clip": "none", "adam": "epsilon_hat"}
     ),
@@ -205,11 +211,14 @@ def agents_of(spec, state, hyper):
                 critic_targets=[layers(s.critic_target, k, c) for c in critics],
                 actor_adam=adam(s.actor_optimiser, k),
                 critic_adams=[adam(s.critic_optimiser, k, c) for c in critics],
+                average=None if s.actor_average is None else layers(s.actor_average, k),
             )
     return [agents[i] for i in range(spec.num_agents)]
 
 
-def numbers(agent, names=("actor", "actor_target", "critics", "critic_targets", "actor_adam", "critic_adams")):
+def numbers(
+    agent, names=("actor", "actor_target", "critics", "critic_targets", "actor_adam", "critic_adams", "average")
+):
     """All arrays of an agent as {path: array}."""
     tree = {name: getattr(agent, name) for name in names}
     for name in ("actor_adam", "critic_adams"):

@@ -52,11 +52,15 @@ def softmax(logits):
     return weight / weight.sum(axis=1, keepdims=True)
 
 
-def act(space, output, gumbel):
-    """(action, what `act_slope` needs): a Gumbel-softmax sample, its one-hot for hard choices, or a scaled sigmoid."""
+def act(space, output, gumbel, squash="sigmoid"):
+    """(action, what `act_slope` needs): a Gumbel-softmax sample, its one-hot for hard choices, or a scaled sigmoid or
+    tanh."""
+    if is_box(space) and squash == "tanh":
+        half = (space.high - space.low) / 2
+        return space.low + half * (1 + np.tanh(output)), np.cosh(output) ** -2 / 2
     if is_box(space):
         sigmoid = 1 / (1 + np.exp(-output))
-        return space.low + (space.high - space.low) * sigmoid, sigmoid
+        return space.low + (space.high - space.low) * sigmoid, sigmoid * (1 - sigmoid)
     soft = np.concatenate([softmax((output + gumbel)[:, part]) for part in choices(space)], axis=1)
     if type(space).__name__ == "Simplex":
         return soft, soft
@@ -69,7 +73,7 @@ def act(space, output, gumbel):
 def act_slope(space, kept, slope):
     """Gradient of the actor's output for the gradient `slope` of the action (hard choices: straight through)."""
     if is_box(space):
-        return slope * (space.high - space.low) * kept * (1 - kept)
+        return slope * (space.high - space.low) * kept
     out = np.zeros_like(slope)
     for part in choices(space):
         s, d = kept[:, part], slope[:, part]
@@ -158,6 +162,7 @@ class Agent:
     critic_targets: list
     actor_adam: Adam
     critic_adams: list
+    average: list | None = None
 
 
 def take_apart(rows, agents):
@@ -208,14 +213,15 @@ def update(agents, batches, gumbel, normal, move, sequential):
         # Target: r + gamma min_j Q'_j(x', mu'(o')), bootstrapping unless terminated.
         next_a = []
         for j, other in enumerate(agents if sequential else before):
-            action = act(other.space, forward(other.actor_target, next_x[j])[0], gumbel(other.space.size))[0]
+            output = forward(other.actor_target, next_x[j])[0]
+            action = act(other.space, output, gumbel(other.space.size), other.algorithm.actor_output)[0]
             if algorithm.smoothing:
                 noise = normal(other.space.size)
                 action = smooth(other.space, action, noise, h.target_noise, h.target_noise_clip)
             next_a.append(action)
         read = np.concatenate([*next_x, *next_a] if central else [next_x[i], next_a[i]], axis=1)
         values = [forward(target, read)[0][:, 0] for target in agent.critic_targets]
-        y = r[i] + h.gamma * discount * np.min(values, axis=0)
+        y = algorithm.reward_scale * r[i] + h.gamma * discount * np.min(values, axis=0)
 
         # Critics: mean squared error, each with its own optimiser.
         read = np.concatenate([*x, *a] if central else [x[i], a[i]], axis=1)
@@ -238,7 +244,7 @@ def update(agents, batches, gumbel, normal, move, sequential):
 
         # Actor: climbs the first critic (as it now is) with its own action drawn anew and the others' as replayed.
         output, kept = forward(agent.actor, x[i])
-        own, kept_act = act(agent.space, output, gumbel(agent.space.size))
+        own, kept_act = act(agent.space, output, gumbel(agent.space.size), algorithm.actor_output)
         mixed = [own if j == i else a[j] for j in range(len(agents))]
         q, kept_q = forward(agent.critics[0], np.concatenate([*x, *mixed] if central else [x[i], own], axis=1))
         metrics[2, i] = -q.mean() + h.logit_regulariser * (output**2).mean()
@@ -252,6 +258,8 @@ def update(agents, batches, gumbel, normal, move, sequential):
         agent.actor, agent.actor_adam = adam_step(agent.actor, agent.actor_adam, gradients, h.actor_lr, algorithm.adam)
 
         agent.actor_target = towards(agent.actor_target, agent.actor, h.tau)
+        if agent.average is not None:
+            agent.average = towards(agent.average, agent.actor, algorithm.actor_average)
         agent.critic_targets = [
             towards(target, online, h.tau) for target, online in zip(agent.critic_targets, agent.critics, strict=True)
         ]

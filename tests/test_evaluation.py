@@ -85,6 +85,26 @@ def test_episodes_by_hand():
     assert np.ptp(found.episode_return[:, 0, 0]) > 1e-3, "seeds have policies of their own"
 
 
+def test_deterministic_evaluations_play_the_averaged_actors():
+    """With `actor_average` an evaluation is that of the averages, put in the actors' place; sampled ones are not."""
+    result = matd3_jax.train("algo.hidden=[8]", "algo.actor_average=0.2", env=Ledger(), **SMALL)
+    state, training = result.state, result.training
+    averages = tuple(g._replace(actor=g.actor_average) for g in state.groups)
+    assert all(
+        np.abs(np.asarray(a) - np.asarray(b)).max() > 1e-4
+        for g in state.groups
+        for a, b in zip(jax.tree.leaves(g.actor), jax.tree.leaves(g.actor_average), strict=True)
+    )
+    swapped, still = state._replace(groups=averages), training.trainer.policy(state)
+    got = training.evaluate(state, EPISODES, deterministic=True).episode_return
+    np.testing.assert_array_equal(got, training.evaluate(swapped, EPISODES, deterministic=True).episode_return)
+    np.testing.assert_array_equal(result.metrics["agent_0_eval_return"][:, -1], got[..., 0].mean(axis=1))
+    online = rollout.Policy(tuple(g.actor for g in state.groups), still.hyper, still.statistics)
+    jax.tree.map(np.testing.assert_array_equal, still, online)
+    sampled = [training.evaluate(s, EPISODES, deterministic=False).episode_return for s in (state, swapped)]
+    assert (sampled[0] != sampled[1]).any()
+
+
 def test_sampled_play_differs():
     result = run()
     sampled, still = (result.evaluate(EPISODES, deterministic=d) for d in (False, True))

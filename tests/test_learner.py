@@ -46,8 +46,9 @@ class Program:
     def __call__(self, state, rows, known_noise=True):
         """Who samples or smooths gets the table's noise; whether there is noise at all stays the learner's choice."""
 
-        def act(space, output, draw, *scale):
-            return real_act(space, output, None if draw is None else noise_table("gumbel", space.size), *scale)
+        def act(space, output, draw, *scale, **squash):
+            draw = None if draw is None else noise_table("gumbel", space.size)
+            return real_act(space, output, draw, *scale, **squash)
 
         def smooth(space, action, draw, *options):
             return real_smooth(space, action, noise_table("normal", space.size), *options)

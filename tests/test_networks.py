@@ -121,17 +121,18 @@ def test_hard_choices_are_exactly_one_hot():
         assert set(np.unique(got)) == {0, 1} and (got.sum(axis=1) == 1).all()
 
 
-def test_box_actions():
-    """low + (high - low) sigmoid(output), noise in half ranges, never out of the bounds; the deterministic action and
-    the gradient as in the reference."""
+@pytest.mark.parametrize("squash", ["sigmoid", "tanh"])
+def test_box_actions(squash):
+    """low + (high - low) sigmoid(output), or centre + half range tanh(output); noise in half ranges, never out of the
+    bounds; the deterministic action and the gradient as in the reference."""
     rng = np.random.default_rng(0)
     output, draw, weight = rng.normal(size=(3, 50, 2)) * 3
     with jax.enable_x64(True):
-        calm = networks.act(BOX, output, None)
-        noisy = networks.act(BOX, output, draw, 0.1)
-        slope = jax.grad(lambda o: (networks.act(BOX, o, None) * weight).sum())(output)
+        calm = networks.act(BOX, output, None, squash=squash)
+        noisy = networks.act(BOX, output, draw, 0.1, squash)
+        slope = jax.grad(lambda o: (networks.act(BOX, o, None, squash=squash) * weight).sum())(output)
     calm, noisy, slope = map(np.asarray, (calm, noisy, slope))
-    want, kept = reference.act(BOX, output, None)
+    want, kept = reference.act(BOX, output, None, squash)
     np.testing.assert_allclose(calm, want, rtol=TOLERANCE, atol=TOLERANCE)
     np.testing.assert_allclose(slope, reference.act_slope(BOX, kept, weight), rtol=TOLERANCE, atol=TOLERANCE)
     np.testing.assert_allclose(noisy, np.clip(want + 0.1 * 2 * draw, -1, 3), rtol=TOLERANCE, atol=TOLERANCE)

@@ -108,6 +108,29 @@ def test_bounds():
     np.testing.assert_allclose(normalisation.normalise(normalisation.initial(3), x), [[-3.0, 0.7, 10.0]], rtol=1e-6)
 
 
+def test_a_floor_keeps_small_what_hardly_ever_moves():
+    """Deviations below the floor count as the floor, others as they are: of what networks read, not of what is kept."""
+    statistics = Statistics(jnp.array([1.0, 0.5, 0.0]), jnp.array([4.0, 0.0, 1e-6]))
+    x = jnp.array([[3.0, 0.6, 0.02]])
+    got = normalisation.normalise(normalisation.floored(statistics, 0.1), x)
+    np.testing.assert_allclose(got, [[1, 1, 0.2]], atol=1e-5)
+    assert normalisation.normalise(statistics, x)[0, 2] > 9
+    t, state, _, _ = run()
+    t.least_deviation = 0.4
+    try:
+        for seed in range(SEEDS):
+            kept, read = of_seed(state.statistics, seed), of_seed(t.policy(state).statistics, seed)
+            np.testing.assert_allclose(read.variance, np.maximum(kept.variance, 0.16), rtol=1e-6)
+            np.testing.assert_array_equal(read.mean, kept.mean)
+            assert (kept.variance < 0.16).any() and (kept.variance > 0.16).any()
+            rows = np.asarray(t.minibatches(state, [HYPER], seed, jnp.arange(5)))
+            raw = np.asarray(state.replay[seed, :5])
+            want = (raw[:, :12] - kept.mean) / np.sqrt(np.maximum(kept.variance, 0.16))
+            np.testing.assert_allclose(rows[:, :12], np.clip(want, -10, 10), rtol=1e-4, atol=1e-5)
+    finally:
+        t.least_deviation = 0.0
+
+
 # ---- where networks read ---------------------------------------------------------------------------------------------
 
 

@@ -32,7 +32,8 @@ class Physical(NamedTuple):
 class Engine(Protocol):
     """A robot's model with the program that steps it."""
 
-    mj_model: mujoco.MjModel
+    @property
+    def mj_model(self) -> mujoco.MjModel: ...
 
     def advance(
         self,

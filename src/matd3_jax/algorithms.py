@@ -28,6 +28,13 @@ class Algorithm:
     actor_output: Literal["sigmoid", "tanh"] = "sigmoid"
     """How a Box action follows from an actor's output u: low + (high - low) sigmoid(u), or centre + half range tanh(u),
     which is the sigmoid of 2u: twice the slope."""
+    reward_scale: float = 1.0
+    """Of the rewards that the critics learn from; reported returns and Q-bias stay in the environment's units."""
+    actor_average: float = 0.0
+    """Share of the online actor that an averaged actor takes on whenever the actor moves: the policy that deterministic
+    evaluations play. 0: there is none, evaluations play the online actor."""
+    noise_range: bool = False
+    """The exploration noise of each environment and agent is drawn from a range at the start of every episode."""
     smoothing: bool = False
     """Add clipped Gaussian noise to the targets' actions (target policy smoothing)."""
     sync_targets: bool = True
@@ -48,7 +55,10 @@ class HyperParams(NamedTuple):
     target_noise_clip: chex.Array | float
     """Bound of the smoothing noise, in the same units."""
     exploration_noise: chex.Array | float
-    """Standard deviation of the noise added to Box actions while collecting, in units of the half range."""
+    """Standard deviation of the noise added to Box actions while collecting, in units of the half range; with
+    `Algorithm.noise_range` the lower end of the range."""
     logit_regulariser: chex.Array | float
     """Weight of the mean squared actor output (logits, or the number before the squashing) in the actor loss."""
     max_grad_norm: chex.Array | float
+    exploration_noise_high: chex.Array | float = 0.0
+    """The upper end; read with `Algorithm.noise_range` only."""

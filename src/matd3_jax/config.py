@@ -15,25 +15,37 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from matd3_jax import cluster, devices
+from matd3_jax import cluster
 from matd3_jax.algorithms import Algorithm, HyperParams
 from matd3_jax.envs.base import OptionError, nearest
 from matd3_jax.errors import UserError
 from matd3_jax.typed import plain, typed
 from matd3_jax.validation import check
 
-ADDED_LATER = {"eval_every": 0, "eval_episodes": 10, "n_step": 1, "normalise_observations": False,
-               "diagnostics": {"q_bias": False, "q_bias_rollouts": 200, "q_bias_steps": 100},
-               "algo": {"actor_output": "sigmoid"}, "adversary": {"actor_output": "sigmoid"}}  # fmt: skip
+ADDED_TO_ALGO = {"actor_output": "sigmoid", "actor_average": 0.0, "reward_scale": 1.0}
+ADDED_LATER = {
+    "recipe": "paper",
+    "eval_every": 0,
+    "eval_episodes": 10,
+    "n_step": 1,
+    "normalise_observations": False,
+    "normalise_least_deviation": 0.0,
+    "diagnostics": {"q_bias": False, "q_bias_rollouts": 200, "q_bias_steps": 100},
+    "algo": ADDED_TO_ALGO,
+    "adversary": ADDED_TO_ALGO,
+}
 """Keys that runs from before them lack, with the values that those runs had in effect; a group may lack some, too."""
 
-GROUPS = ("env", "algo", "adversary", "schedule")
+HYPER_PARAMS = tuple(name for name in HyperParams._fields if name != "exploration_noise_high")
+"""Settings of an algorithm that may differ between runs of one program."""
+
+GROUPS = ("env", "algo", "adversary", "recipe")
 """Keys that choose a file; `adversary` takes the files of `algo`."""
 
-SCHEDULE = ("num_envs", "rollout_length", "updates_per_collect", "batch_size")
-"""Keys that a file of the group `schedule` sets."""
+NOUNS = {"env": "environment", "algo": "algorithm", "adversary": "algorithm", "recipe": "recipe"}
 
-NOUNS = {"env": "environment", "algo": "algorithm", "adversary": "algorithm", "schedule": "schedule"}
+ROBOT_RECIPE = "fast"
+"""What robots train by unless a recipe is given, on every machine."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,19 +67,25 @@ class AlgoConfig:
     clip: str
     max_grad_norm: float
     logit_regulariser: float
-    exploration_noise: float
+    exploration_noise: float | tuple[float, float]
     sync_targets: bool
     adam: str
     actor_output: str
+    actor_average: float
+    reward_scale: float
 
     def algorithm(self) -> Algorithm:
         """What fixes the shape of the learner."""
-        shared = {field.name for field in dataclasses.fields(Algorithm)} - {"smoothing"}
-        return Algorithm(smoothing=self.target_noise > 0, **{name: getattr(self, name) for name in shared})
+        derived: dict[str, Any] = {"smoothing": self.target_noise > 0, "noise_range": isinstance(self.exploration_noise, tuple)}
+        shared = {field.name for field in dataclasses.fields(Algorithm)} - set(derived)
+        return Algorithm(**derived, **{name: getattr(self, name) for name in shared})
 
     def hyper_params(self) -> HyperParams:
         """What may differ between runs of one program."""
-        return HyperParams(**{name: getattr(self, name) for name in HyperParams._fields})
+        noise = self.exploration_noise
+        low, high = noise if isinstance(noise, tuple) else (noise, noise)
+        same = {name: getattr(self, name) for name in HYPER_PARAMS if name != "exploration_noise"}
+        return HyperParams(**same, exploration_noise=low, exploration_noise_high=high)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,6 +101,7 @@ class DiagnosticsConfig:
 class Config:
     """All settings of a run; conf/config.yaml says what each means."""
 
+    recipe: str
     env: Mapping[str, Any]
     """Name and options of the environment, for `envs.make`."""
     algo: AlgoConfig
@@ -99,6 +118,7 @@ class Config:
     update_order: str
     n_step: int
     normalise_observations: bool
+    normalise_least_deviation: float
     replay_capacity: int
     learning_starts: int
     warmup: str
@@ -127,7 +147,7 @@ class Config:
 def load(overrides: Sequence[str] = ()) -> Config:
     """The configuration that overrides in Hydra's grammar (`env=simple_tag`, `algo.lr=0.003`) give.
 
-    Robots have the paper's schedule on a CPU and the wide one on an accelerator, unless one, or part of one, is given.
+    Robots take their settings from a recipe (`ROBOT_RECIPE` unless one is given), all others have the paper's.
 
     Raises UserError, naming the key and the nearest valid ones, for whatever is not known or not possible.
     """
@@ -140,7 +160,8 @@ def load(overrides: Sequence[str] = ()) -> Config:
     # Files first: Hydra wants them chosen before their values are changed.
     chosen = [o for o in parsed if o.key_or_group in GROUPS]
     values = [o for o in parsed if o.key_or_group not in GROUPS]
-    lines = [f"{o.key_or_group}={o.value()}" for o in chosen if o.key_or_group != "adversary"]
+    lines = [f"{o.key_or_group}={o.value()}" for o in chosen if o.key_or_group in ("env", "algo")]
+    recipe = [o.value() for o in chosen if o.key_or_group == "recipe"]
     adversary = [o.value() for o in chosen if o.key_or_group == "adversary"]
     if not adversary and any(o.key_or_group.startswith("adversary.") for o in values):
         # The same algorithm with other values: start from all that algo= and algo.* say.
@@ -150,13 +171,12 @@ def load(overrides: Sequence[str] = ()) -> Config:
         lines.append(f"+algo@adversary={adversary[-1]}")
     try:
         tree = _files(tuple(lines))
+        if "robot" in tree:
+            lines.append(f"+recipe={recipe[-1] if recipe else ROBOT_RECIPE}")
+        elif recipe and recipe[-1] != "paper":
+            raise UserError(f"recipe={recipe[-1]} is for robots; {tree.env.name} has the paper's settings only")
+        tree = _files(tuple(lines))
         _check_keys(tree, values)
-        if "robot" not in tree and "schedule=wide" in lines:
-            raise UserError(f"schedule=wide is for robots; {tree.env.name} has the paper's only")
-        own = any(o.key_or_group in ("schedule", *SCHEDULE) for o in parsed)
-        if "robot" in tree and not own and devices.accelerated():
-            # One environment and minibatches of 100 would keep it waiting for the next kernel all the time.
-            lines.append("schedule=wide")
         tree = copy.deepcopy(_files(tuple(lines)))
         for override in values:
             if override.is_add() and not override.is_force_add():
@@ -167,12 +187,8 @@ def load(overrides: Sequence[str] = ()) -> Config:
         raise UserError(_one_line(error)) from error
     assert isinstance(resolved, dict)
     resolved["env"] = _with_engine(resolved["env"])
-    for key in (
-        "resume",
-        "checkpoint",
-        *cluster.KEYS,
-        "robot",
-    ):  # the command's own, see train.py; what robots bring is in its place
+    # The command's own (see train.py), and what only serves the files.
+    for key in ("resume", "checkpoint", *cluster.KEYS, "robot", "per_algorithm"):
         resolved.pop(key, None)
     return from_dict(resolved)  # type: ignore[arg-type]
 

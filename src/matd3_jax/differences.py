@@ -112,7 +112,7 @@ _ABSENT = object()
 
 def _defaults(config: Config) -> dict[str, Any]:
     """What the names of environment and algorithms bring along by themselves; nothing if they are not known here."""
-    lines = [f"env={config.env['name']}", f"algo={config.algo.name}", "schedule=paper"]
+    lines = [f"env={config.env['name']}", f"algo={config.algo.name}", f"recipe={config.recipe}"]
     lines += [f"adversary={config.adversary.name}"] if config.adversary else []
     try:
         return learning(configuration.load(lines))

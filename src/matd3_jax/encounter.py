@@ -90,12 +90,12 @@ def team_of(training: Training, env: Environment, state: TrainState, team: str) 
             observation_sizes=tuple(whole.observation_sizes[i] for i in who),
             action_spaces=tuple(whole.action_spaces[i] for i in who),
             # Acting knows of no critics: algorithms that differ in these only share their programs.
-            algorithms=(Algorithm("actor", hidden=algorithm.hidden),) * len(who),
+            algorithms=(_acting(algorithm),) * len(who),
         ),
     )
     # Through the host: the seeds may lie on different devices, copies behind the last of them.
     seeds = training.config.seeds
-    policy = jax.tree.map(lambda leaf: np.asarray(leaf)[:seeds], training.trainer.policy(state))
+    policy = jax.tree.map(lambda leaf: np.asarray(leaf)[:seeds], training.trainer.policy(state, average=True))
     actors, hyper = [], []
     for group in own.spec.groups:
         places = [whole.place(who[i]) for i in group.members]
@@ -160,6 +160,13 @@ def _program(env: Environment, sides: tuple[Side, ...], devices: tuple, episodes
     mesh = Mesh(np.array(devices), ("pairs",))
     specs = (P(), P("pairs"), P())
     return jax.jit(jax.shard_map(each, mesh=mesh, in_specs=specs, out_specs=P("pairs"), check_vma=False))
+
+
+def _acting(algorithm: Algorithm) -> Algorithm:
+    """What acting knows of an algorithm."""
+    return Algorithm(
+        "actor", hidden=algorithm.hidden, actor_output=algorithm.actor_output, noise_range=algorithm.noise_range
+    )
 
 
 def _members(env: Environment, team: str) -> tuple[int, ...]:

@@ -88,7 +88,7 @@ def play(
     steps = training.env.episode_length if max_steps is None else min(max_steps, training.env.episode_length)
     trainer = training.trainer
     # Through the host: the seeds may lie on different devices.
-    policy = jax.device_get(jax.tree.map(lambda leaf: leaf[seed], trainer.policy(state, trainer.hyper)))
+    policy = jax.device_get(jax.tree.map(lambda leaf: leaf[seed], trainer.policy(state, average=deterministic)))
     env, spec = training.env, training.spec
 
     def run(policy, key):

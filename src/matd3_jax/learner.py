@@ -28,6 +28,8 @@ class GroupState(NamedTuple):
     critic_target: chex.ArrayTree
     actor_optimiser: optax.OptState
     critic_optimiser: optax.OptState
+    actor_average: chex.ArrayTree | None = None
+    """With `Algorithm.actor_average` alone."""
 
 
 class UpdateMetrics(NamedTuple):
@@ -112,7 +114,8 @@ def init(spec: Spec, key: chex.PRNGKey) -> tuple[GroupState, ...]:
             mu_target = actor.init(keys[2], observation)["params"]
             q_target = critic.init(keys[3], inputs)["params"]
         adam = optimiser.adam(algorithm.adam)
-        return GroupState(mu, q, mu_target, q_target, adam.init(mu), adam.init(q))
+        average = jax.tree.map(jnp.copy, mu) if algorithm.actor_average else None
+        return GroupState(mu, q, mu_target, q_target, adam.init(mu), adam.init(q), average)
 
     keys = jax.random.split(key, spec.num_agents)
     return tuple(
@@ -228,7 +231,8 @@ def _update_agent(
     # y_i = r_i + gamma * min_j Q'_ij(x', a'_1, ..., a'_N)
     next_inputs = jnp.concatenate([batch.next_x, next_action], axis=-1)
     next_q = apply(critic, state.critic_target, next_inputs)[..., 0].min(axis=0)
-    y = batch.reward + hyper.gamma * batch.discount * next_q
+    reward = batch.reward if algorithm.reward_scale == 1 else algorithm.reward_scale * batch.reward
+    y = reward + hyper.gamma * batch.discount * next_q
 
     def critic_loss(params):
         q = apply(critic, params, batch.inputs)[..., 0]
@@ -265,6 +269,9 @@ def _update_agent(
         actor_target=optax.incremental_update(mu_params, state.actor_target, hyper.tau),
         critic_target=optax.incremental_update(q_params, state.critic_target, hyper.tau),
     )
+    if algorithm.actor_average:
+        average = optax.incremental_update(mu_params, state.actor_average, algorithm.actor_average)
+        state = state._replace(actor_average=average)
     return state, (loss, q_value, mu_loss)
 
 

@@ -42,6 +42,12 @@ def merge(statistics: Statistics, x: chex.Array, collects: chex.Array) -> Statis
     )
 
 
+def floored(statistics: Statistics, deviation: float) -> Statistics:
+    """Statistics with standard deviations of at least `deviation`: entries that hardly ever move (contact forces) then
+    stay small when they do, instead of filling the range that others have."""
+    return statistics._replace(variance=jnp.maximum(statistics.variance, deviation**2))
+
+
 def normalise(statistics: Statistics, x: chex.Array) -> chex.Array:
     """(x - mean) / standard deviation, within +-10, of joint observations x [..., observation_size]."""
     scaled = (x - statistics.mean) / jnp.sqrt(statistics.variance + LEAST_VARIANCE)

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from matd3_jax import config as configuration
-from matd3_jax.algorithms import HyperParams
-from matd3_jax.config import AlgoConfig, Config
+from matd3_jax.config import HYPER_PARAMS, AlgoConfig, Config
 from matd3_jax.errors import UserError
 
 
@@ -18,7 +17,9 @@ def program(config: Config) -> str:
     places."""
 
     def shape(team: AlgoConfig) -> AlgoConfig:
-        free: dict[str, Any] = dict.fromkeys(HyperParams._fields, 0.0)
+        free: dict[str, Any] = dict.fromkeys(HYPER_PARAMS, 0.0)
+        if isinstance(team.exploration_noise, tuple):
+            free["exploration_noise"] = (0.0, 0.0)
         free["target_noise"] = float(team.algorithm().smoothing)  # without noise a program has no smoothing in it
         return dataclasses.replace(team, **free)
 

@@ -17,9 +17,6 @@ from matd3_jax.envs.base import Environment
 from matd3_jax.rollout import Policy
 from matd3_jax.spec import Spec
 
-APART = 2**31 - 1
-"""Folded into keys of the training: `split` and the training's own `fold_in` never get that far."""
-
 
 class Pairs(NamedTuple):
     """States and joint actions; leading axis [pairs]."""
@@ -85,7 +82,7 @@ def measure(
 
 
 def estimate(spec: Spec, policy: Policy, critics: Sequence[chex.ArrayTree], inputs: chex.Array) -> chex.Array:
-    """Q_i(x, a) of every agent, mean over its critics: [pairs, num_agents]."""
+    """Q_i(x, a) of every agent, mean over its critics, in the units of its rewards: [pairs, num_agents]."""
     x, action = jnp.split(inputs, [spec.observation_size], axis=-1)
     if policy.statistics is not None:
         x = normalisation.normalise(policy.statistics, x)
@@ -97,7 +94,8 @@ def estimate(spec: Spec, policy: Policy, critics: Sequence[chex.ArrayTree], inpu
             if group.algorithm.critic == "own":
                 parts = [spec.observation_part(x, i), spec.action_part(action, i)]
             own = jax.tree.map(lambda leaf, k=k: leaf[k], params)
-            values[i] = learner.apply(network, own, jnp.concatenate(parts, axis=-1))[..., 0].mean(axis=0)
+            value = learner.apply(network, own, jnp.concatenate(parts, axis=-1))[..., 0].mean(axis=0)
+            values[i] = value / group.algorithm.reward_scale
     return jnp.stack(values, axis=-1)
 
 

@@ -6,12 +6,16 @@ from typing import Any, NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from matd3_jax import learner, networks, normalisation
 from matd3_jax.algorithms import HyperParams
 from matd3_jax.envs.base import Environment
 from matd3_jax.normalisation import Statistics
 from matd3_jax.spec import Spec
+
+APART = 2**31 - 1
+"""Folded into a key whose `split` and other `fold_in` never get that far."""
 
 
 class Policy(NamedTuple):
@@ -34,6 +38,9 @@ class EnvState(NamedTuple):
     """[num_envs, num_agents] reward gathered so far in the running episodes."""
     episode_step: chex.Array
     """[num_envs] env steps so far in the running episodes."""
+    noise_quantile: chex.Array | None = None
+    """[num_envs, num_agents] uniform on [0, 1): where in its range each agent's exploration noise is in the running
+    episode. None where no agent has a range (see `ranged`)."""
 
 
 class Episodes(NamedTuple):
@@ -56,10 +63,17 @@ class Evaluation(NamedTuple):
     """[episodes, measures] of the environment (`Environment.measures`), means over the env steps of the episode."""
 
 
-def start(env: Environment, key: chex.PRNGKey, num_envs: int) -> EnvState:
-    """Fresh episodes in `num_envs` environments."""
+def start(env: Environment, key: chex.PRNGKey, num_envs: int, noise_range: bool = False) -> EnvState:
+    """Fresh episodes in `num_envs` environments; `noise_range`: with noise quantiles."""
     state, observation = jax.vmap(env.reset)(jax.random.split(key, num_envs))
-    return EnvState(state, observation, jnp.zeros((num_envs, len(env.agents))), jnp.zeros(num_envs, jnp.int32))
+    shape = (num_envs, len(env.agents))
+    quantile = jax.random.uniform(jax.random.fold_in(key, APART), shape) if noise_range else None
+    return EnvState(state, observation, jnp.zeros(shape), jnp.zeros(num_envs, jnp.int32), quantile)
+
+
+def ranged(spec: Spec) -> bool:
+    """Whether an agent's exploration noise is drawn from a range."""
+    return any(algorithm.noise_range for algorithm in spec.algorithms)
 
 
 def collect(
@@ -87,9 +101,10 @@ def collect(
     noise = _noise(spec, noise_key, (length, num_envs), random)
 
     def step(carry: EnvState, inputs):
-        draws, step_keys, fresh = inputs
+        draws, step_keys, fresh, fresh_quantile = inputs
         before = carry.state if keep_states else None
-        action = spec.join_actions(draws) if random else act(spec, policy, carry.observation, draws)
+        quantile = 0.5 if carry.noise_quantile is None else carry.noise_quantile
+        action = spec.join_actions(draws) if random else act(spec, policy, carry.observation, draws, quantile)
         after = jax.vmap(env.step)(step_keys, carry.state, env_actions(spec, action))
         x, next_x = (jnp.concatenate(o, axis=-1) for o in (carry.observation, after.observation))
         rows = spec.pack_rows(x, action, after.reward, next_x, after.terminated, after.truncated)
@@ -99,18 +114,24 @@ def collect(
         episodes = Episodes(
             ended.sum(), jnp.where(ended[:, None], returns, 0).sum(axis=0), jnp.where(ended, steps, 0).sum()
         )
-        state, observation = jax.tree.map(
+        state, observation, quantile = jax.tree.map(
             lambda new, old: jnp.where(ended.reshape(ended.shape + (1,) * (old.ndim - 1)), new, old),
-            fresh,
-            (after.state, after.observation),
+            (*fresh, fresh_quantile),
+            (after.state, after.observation, carry.noise_quantile),
         )
-        carry = EnvState(state, observation, jnp.where(ended[:, None], 0, returns), jnp.where(ended, 0, steps))
+        returns, steps = jnp.where(ended[:, None], 0, returns), jnp.where(ended, 0, steps)
+        carry = EnvState(state, observation, returns, steps, quantile)
         return carry, (rows, episodes, before)
 
     step_keys, reset_keys = (jax.random.split(k, (length, num_envs)) for k in (step_key, reset_key))
     # Every step has a fresh start at hand, drawn in one batch: inside the loop they would be as many, drawn one by one.
     fresh = jax.vmap(jax.vmap(env.reset))(reset_keys)
-    env_state, (rows, episodes, states) = jax.lax.scan(step, env_state, (noise, step_keys, fresh), unroll=unroll)
+    fresh_quantiles = None
+    if env_state.noise_quantile is not None:
+        shape = (length, *env_state.noise_quantile.shape)
+        fresh_quantiles = jax.random.uniform(jax.random.fold_in(noise_key, APART), shape)
+    inputs = (noise, step_keys, fresh, fresh_quantiles)
+    env_state, (rows, episodes, states) = jax.lax.scan(step, env_state, inputs, unroll=unroll)
     rows, states = jax.tree.map(lambda leaf: leaf.reshape(length * num_envs, *leaf.shape[2:]), (rows, states))
     return env_state, rows, jax.tree.map(lambda e: e.sum(axis=0), episodes), states
 
@@ -182,11 +203,15 @@ def act(
     policy: Policy,
     observation: Sequence[chex.Array],
     draws: Sequence[chex.Array | None] | None,
+    noise_quantile: chex.Array | float = 0.5,
 ) -> chex.Array:
     """Joint actions [envs, action_size] for one observation [envs, size] per agent.
 
-    draws: noise [members, envs, action size] per group (see `networks.noise`); None, for one group or all:
+    Args:
+        draws: noise [members, envs, action size] per group (see `networks.noise`); None, for one group or all:
             deterministic actions.
+        noise_quantile: [envs, num_agents] where in its range the exploration noise of an agent that has one is;
+            outside of collecting the middle.
     """
     parts, statistics = [], policy.statistics
     if statistics is not None:
@@ -195,8 +220,12 @@ def act(
         stacked = jnp.stack([observation[i] for i in group.members])
         output = learner.apply(learner.actor_of(group), policy.actors[g], stacked)
         draw = None if draws is None else draws[g]
-        scale, squash = policy.hyper[g].exploration_noise, group.algorithm.actor_output
-        parts.append(networks.act(group.action_space, output, draw, scale, squash))
+        scale = policy.hyper[g].exploration_noise
+        if group.algorithm.noise_range:
+            quantile = jnp.broadcast_to(noise_quantile, (stacked.shape[1], spec.num_agents))
+            own = quantile[:, np.array(group.members)].T[..., None]
+            scale = scale + own * (policy.hyper[g].exploration_noise_high - scale)
+        parts.append(networks.act(group.action_space, output, draw, scale, group.algorithm.actor_output))
     return spec.join_actions(parts)
 
 

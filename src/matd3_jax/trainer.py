@@ -68,6 +68,7 @@ class Trainer:
             all of them elsewhere.
         normalise_observations: networks see observations in units of their running mean and standard deviation; the
             replay keeps them as they are.
+        least_deviation: of what observations are normalized by.
         q_bias_pairs: states and actions that each seed keeps for `measure_q_bias`; 0: none, and no trace of it in the
             programs.
         unroll: cycles of a chunk, and updates of a collect with many, that one iteration of their loop holds; longer
@@ -85,6 +86,7 @@ class Trainer:
         devices: Sequence[jax.Device] | None = None,
         piece: int | None = None,
         normalise_observations: bool = False,
+        least_deviation: float = 0.0,
         q_bias_pairs: int = 0,
         unroll: int = 1,
         unroll_steps: int = 1,
@@ -93,6 +95,7 @@ class Trainer:
         self.env, self.spec, self.schedule, self.num_seeds = env, spec, schedule, num_seeds
         self.unroll, self.unroll_steps = unroll, unroll_steps
         self.normalise_observations, self.q_bias_pairs = normalise_observations, q_bias_pairs
+        self.least_deviation = least_deviation
         updates = schedule.updates_per_collect
         for group in spec.groups:
             delay = group.algorithm.policy_delay
@@ -198,7 +201,8 @@ class Trainer:
     def _init(self) -> Callable:
         def one(key):
             network_key, env_key, key = jax.random.split(key, 3)
-            return learner.init(self.spec, network_key), rollout.start(self.env, env_key, self.schedule.num_envs), key
+            env = rollout.start(self.env, env_key, self.schedule.num_envs, rollout.ranged(self.spec))
+            return learner.init(self.spec, network_key), env, key
 
         def init(keys):
             groups, env, keys = jax.vmap(one)(keys)
@@ -230,10 +234,24 @@ class Trainer:
         reservoir = Reservoir(seeds, everywhere) if self.q_bias_pairs else None
         return TrainState(seeds, seeds, seeds, seeds, everywhere, statistics, reservoir)
 
-    def policy(self, state: TrainState, hyper: tuple[HyperParams, ...] | None = None) -> Policy:
-        """How each seed acts, leading axis [seeds]. hyper: of the seeds in `state`; default: of all."""
-        actors = tuple(group.actor for group in state.groups)
-        return Policy(actors, self.hyper if hyper is None else hyper, state.statistics)
+    def policy(self, state: TrainState, hyper: tuple[HyperParams, ...] | None = None, average: bool = False) -> Policy:
+        """How each seed acts, leading axis [seeds].
+
+        Args:
+            hyper: of the seeds in `state`; default: of all.
+            average: with the averaged actors, where there are any.
+        """
+        averages = [group.actor_average if average else None for group in state.groups]
+        actors = tuple(
+            group.actor if mean is None else mean for group, mean in zip(state.groups, averages, strict=True)
+        )
+        return Policy(actors, self.hyper if hyper is None else hyper, self.scale(state))
+
+    def scale(self, state: TrainState) -> Statistics | None:
+        """What observations are normalized by: running statistics, with the least deviation that is set."""
+        if state.statistics is None or not self.least_deviation:
+            return state.statistics
+        return normalisation.floored(state.statistics, self.least_deviation)
 
     def collect(self, state: TrainState, hyper, random: bool = False) -> tuple[TrainState, Episodes]:
         """One collect of all local seeds."""
@@ -248,7 +266,7 @@ class Trainer:
         env, rows, episodes, states = jax.vmap(one)(self.policy(state, hyper), state.env, keys[:, 0])
         if state.reservoir is not None:
             # A key apart from those that `rollout.collect` splits off the same one: training stays as it is without.
-            apart = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys[:, 0], q_bias.APART)
+            apart = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys[:, 0], rollout.APART)
             share = 1 / (state.collects + 1.0 - state.reservoir.since)
             new = Pairs(states, self.spec.row_parts(rows).inputs)
             pairs = jax.vmap(q_bias.keep, in_axes=(0, 0, None, 0))(state.reservoir.pairs, new, share, apart)
@@ -318,9 +336,10 @@ class Trainer:
             written = replay.Written(schedule.replay_capacity, schedule.collect_steps, state.collects)
             gamma = jnp.stack([jnp.asarray(hyper[spec.place(i)[0]].gamma) for i in range(spec.num_agents)])
             rows = returns.draw(spec, state.replay, seed, indices, written, schedule.num_envs, gamma)
-        if state.statistics is None:
+        scale = self.scale(state)
+        if scale is None:
             return rows
-        return normalisation.normalise_rows(self.spec, jax.tree.map(lambda s: s[seed], state.statistics), rows)
+        return normalisation.normalise_rows(self.spec, jax.tree.map(lambda s: s[seed], scale), rows)
 
     def cycle(self, state: TrainState, hyper) -> tuple[TrainState, Metrics]:
         episodes, metrics = [], []
@@ -349,11 +368,12 @@ class Trainer:
 
     def evaluate(self, state: TrainState, keys: chex.PRNGKey, episodes: int, deterministic: bool) -> Evaluation:
         """`rollout.evaluate` of each seed, leading axis [num_seeds]; one program for each kind and number of episodes.
+        Deterministic evaluations play the averaged actors, where there are any.
 
         Args:
             keys: [num_seeds].
         """
-        found = self._evaluate(self.policy(state), self.fill(keys), episodes, deterministic)
+        found = self._evaluate(self.policy(state, average=deterministic), self.fill(keys), episodes, deterministic)
         return jax.tree.map(lambda leaf: leaf[: self.num_seeds], found)
 
     @cached_property
@@ -377,7 +397,7 @@ class Trainer:
     def _measure_q_bias(self) -> Callable:
         def measure(policy, critics, pairs, keys, steps):
             def one(policy, critics, pairs, key):
-                apart = jax.random.fold_in(key, q_bias.APART)
+                apart = jax.random.fold_in(key, rollout.APART)
                 return q_bias.measure(self.env, self.spec, policy, critics, pairs, apart, steps)
 
             return self._sharded(jax.vmap(one), P("seeds"), P("seeds"))(policy, critics, pairs, keys)

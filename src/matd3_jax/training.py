@@ -96,7 +96,9 @@ class Training:
         hyper = {team: self._hyper(team) for team in teams}
         seeds, normalise = len(self.seeds), config.normalise_observations
         local = jax.local_devices()
-        trainer = Trainer(self.env, self.spec, schedule, hyper, seeds, local, normalise_observations=normalise)
+        least = config.normalise_least_deviation
+        options: dict[str, Any] = {"normalise_observations": normalise, "least_deviation": least}
+        trainer = Trainer(self.env, self.spec, schedule, hyper, seeds, local, **options)
         # Whole chunks of equal length, so that one compiled program does for all; as many as come closest to log_every.
         cycles = max(1, math.ceil((config.total_steps - trainer.prefill_steps) / trainer.cycle_steps))
         wanted = max(1, round((config.log_every or config.total_steps / 100) / trainer.cycle_steps))
@@ -108,9 +110,7 @@ class Training:
         capacity = min(config.replay_capacity, self.total_steps)
         schedule = dataclasses.replace(schedule, replay_capacity=capacity)
         kept = config.diagnostics.q_bias_rollouts if config.diagnostics.q_bias else 0
-        self.trainer = Trainer(
-            self.env, self.spec, schedule, hyper, seeds, local, normalise_observations=normalise, q_bias_pairs=kept
-        )
+        self.trainer = Trainer(self.env, self.spec, schedule, hyper, seeds, local, q_bias_pairs=kept, **options)
 
     def _hyper(self, team: str) -> HyperParams:
         """The team's hyper-parameters, leaves [seeds]."""

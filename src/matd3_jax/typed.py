@@ -21,6 +21,12 @@ def typed(cls: Any, values: Mapping[str, Any], prefix: str) -> Any:
 
 
 def _convert(key: str, value: Any, hint: Any) -> Any:
+    if hint == float | tuple[float, float]:
+        if isinstance(value, list | tuple):
+            if len(value) != 2:
+                raise UserError(f"{key}={value!r}: must be a number, or a range [low,high]")
+            return tuple(_convert(key, end, float) for end in value)
+        return _convert(key, value, float)
     options = typing.get_args(hint) if not hasattr(hint, "__origin__") else ()
     if type(None) in options:
         if value is None:

@@ -33,6 +33,12 @@ def check(config: "Config") -> None:
     for key in ("eval_every", "checkpoint_every"):
         value = getattr(config, key)
         need(value is None or value >= 0, f"{key}={value}: must not be negative")
+    least = config.normalise_least_deviation
+    need(0 <= least < math.inf, f"normalise_least_deviation={least}: must not be negative")
+    need(
+        not least or config.normalise_observations,
+        f"normalise_least_deviation={least} goes with normalise_observations=true",
+    )
     diagnostics = config.diagnostics
     for key in ("q_bias_rollouts", "q_bias_steps"):
         value = getattr(diagnostics, key)
@@ -82,10 +88,16 @@ def _check_team(name: str, team: "AlgoConfig", updates: int, need: Any) -> None:
     for key in ("actor_lr", "critic_lr", "max_grad_norm"):
         value = getattr(team, key)
         need(0 < value < math.inf, f"{name}.{key}={value}: must be positive")
-    for key in ("target_noise", "target_noise_clip", "logit_regulariser", "exploration_noise"):
+    for key in ("target_noise", "target_noise_clip", "logit_regulariser"):
         value = getattr(team, key)
         need(0 <= value < math.inf, f"{name}.{key}={value}: must not be negative")
-    for key in ("gamma", "tau"):
+    noise = team.exploration_noise
+    low, high = noise if isinstance(noise, tuple) else (noise, noise)
+    shown = list(noise) if isinstance(noise, tuple) else noise
+    need(0 <= low < math.inf and high < math.inf, f"{name}.exploration_noise={shown}: must not be negative")
+    need(low <= high, f"{name}.exploration_noise={shown}: a range [low,high] must not end below its start")
+    need(0 < team.reward_scale < math.inf, f"{name}.reward_scale={team.reward_scale}: must be positive")
+    for key in ("gamma", "tau", "actor_average"):
         value = getattr(team, key)
         need(0 <= value <= 1, f"{name}.{key}={value}: must lie between 0 and 1")
     need(all(width >= 1 for width in team.hidden), f"{name}.hidden={list(team.hidden)}: widths must be at least 1")
