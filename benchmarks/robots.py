@@ -4,9 +4,9 @@
                                 [out=FILE.json] [key=value ...]
 
 Other keys are settings of the run. Environments are counted for each seed, rates over all seeds together; the seeds are
-spread over the devices (one for each CPU core), so `seeds` should be a multiple of them. Every row replays 100
-transitions for each env step, in minibatches of 100 with one environment and of about 1,000 with more: the paper's
-schedule and the wide one. Parts as in `benchmarks.throughput`. `loops=false`: the environment alone.
+spread over the devices (one for each CPU core), so `seeds` should be a multiple of them. Every row has the paper's
+networks and replays 100 transitions for each env step, in minibatches of 100 with one environment (recipe=paper) and of
+about 1,000 with more. Parts as in `benchmarks.throughput`. `loops=false`: the environment alone.
 """
 
 import json
@@ -73,6 +73,7 @@ def schedule(num_envs: int) -> list[str]:
         batch = round(100 * num_envs / updates)
     steps = 1000 * num_envs  # a short run's replay: its size changes the memory, not the work
     return [
+        "recipe=paper",
         f"num_envs={num_envs}",
         f"updates_per_collect={updates}",
         f"batch_size={batch}",

@@ -1,64 +1,55 @@
 """`python -m experiments.ant`: MATD3 beside MADDPG, IL-TD3 and single-agent TD3 on a robot shared out among agents.
 
-    python -m experiments.ant [env=ant] [algos=[matd3,maddpg,iltd3,td3]] [seeds=6] [train=true]
+    python -m experiments.ant [env=ant] [recipe=fast] [algos=[matd3,maddpg,iltd3,td3]] [seeds=6] [train=true]
                               [runs=runs/ENV] [out=experiments/results/ENV] [key=value ...]
 
 Figure 8 of the paper: deterministic evaluations along training, mean and standard deviation over seeds. `env` is any
-robot; the Ant takes hours, so scale=small is another robot, the half-cheetah, for 60,000 env steps of two seeds, which
-takes half an hour on two cores.
+robot, `recipe` one of its recipes, the same for all algorithms (recipe=paper: the paper's settings, days on a CPU);
+scale=small is another robot, the half-cheetah, for 60,000 env steps of two seeds.
 """
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from experiments import figures, study, verdict
+from experiments import evaluations, figures, study, verdict
 from experiments.study import RESULTS, Study
 from experiments.tidy import Table
 from experiments.verdict import Claim
-from matd3_jax import command
+from matd3_jax import command, config
 from matd3_jax.errors import UserError
-from matd3_jax.statistics import mean_interval
 
-COLUMNS = {"eval_return_agents": "return", "eval_forward_velocity": "forward velocity (m/s)"}
 STANDING = 1000
 """What an ant that stands still gets: 1 for each env step on its feet."""
 
-SMALL = [
-    "seeds=2", "total_steps=60000", "schedule=wide", "updates_per_collect=8", "batch_size=250", "algo.hidden=[128,128]",
-    "eval_every=5000", "eval_episodes=5", "log_every=5000",
-]  # fmt: skip
+SMALL = ["seeds=2", "total_steps=60000", "eval_every=5000", "eval_episodes=5", "log_every=5000"]
 
 
 def settings(scale: str, options: Mapping[str, Any]) -> dict[str, list[str]]:
     env = options["env"] or ("ant" if scale == "paper" else "half_cheetah")
     more = ["seeds=6"] if scale == "paper" else SMALL
-    return {algo: [f"env={env}", f"algo={algo}", *more] for algo in options["algos"]}
+    return {algo: [f"env={env}", f"recipe={options['recipe']}", f"algo={algo}", *more] for algo in options["algos"]}
 
 
 def check(options: Mapping[str, Any]) -> None:
     for algo in options["algos"]:
         if algo not in figures.NAMES:
             raise UserError(f"algos={options['algos']}: {algo!r} is not one of {', '.join(figures.NAMES)}")
+    if options["recipe"] not in config.known_names("recipe"):
+        raise UserError(f"recipe={options['recipe']}: must be one of {', '.join(config.known_names('recipe'))}")
 
 
 def place(options: Mapping[str, Any]) -> tuple[Path, Path]:
     name = options["env"] or ("ant" if options["scale"] == "paper" else "half_cheetah")
     if options["scale"] == "small" and name != "half_cheetah":
         name = f"{name}_small"
+    if options["recipe"] != "fast":
+        name = f"{name}_{options['recipe']}"
     return Path("runs") / name, RESULTS / name
 
 
-def evaluations(table: Table, algo: str, column: str = "eval_return_agents") -> tuple[np.ndarray, np.ndarray] | None:
-    """(env steps [points], values [seeds, points]) of an algorithm's evaluations; None without any."""
-    part = table.where(algo=algo)
-    return (part.by_seed("step")[0], part.by_seed(column)) if len(part) and column in part else None
-
-
 def claims(table: Table) -> list[Claim]:
-    found = {algo: evaluations(table, algo) for algo in ("matd3", "maddpg", "iltd3", "td3")}
+    found = {algo: evaluations.curve(table.where(algo=algo)) for algo in ("matd3", "maddpg", "iltd3", "td3")}
     final = {algo: None if f is None else f[1][:, -1] for algo, f in found.items()}
     early = {algo: None if f is None else f[1][:, f[0] <= f[0][-1] / 2].mean(axis=1) for algo, f in found.items()}
     more = ""
@@ -85,19 +76,11 @@ def claims(table: Table) -> list[Claim]:
 
 
 def draw(table: Table, path: Path) -> None:
-    columns = {name: label for name, label in COLUMNS.items() if name in table}
+    columns = [name for name in evaluations.COLUMNS if name in table]
     figure, axes = figures.canvas(len(columns), width=5.0, height=4.0)
-    for axis, (column, label) in zip(axes, columns.items(), strict=True):
+    for axis, column in zip(axes, columns, strict=True):
         for algo in dict.fromkeys(table["algo"].tolist()):
-            found = evaluations(table, algo, column)
-            assert found is not None
-            steps, curves = found
-            mean, spread = curves.mean(axis=0), curves.std(axis=0, ddof=1) if len(curves) > 1 else 0
-            axis.fill_between(steps, mean - spread, mean + spread, color=figures.COLOURS[algo], alpha=0.2, linewidth=0)
-            name = f"{figures.NAMES[algo]} ({figures.count(len(curves))})"
-            axis.plot(steps, mean, color=figures.COLOURS[algo], label=name)
-        axis.set_xlabel("env steps of each seed")
-        axis.set_ylabel(f"evaluation: {label}")
+            evaluations.draw(axis, table.where(algo=algo), column, figures.COLOURS[algo], figures.NAMES[algo])
     axes[0].legend(frameon=False, fontsize=8, loc="upper left")
     env = table["env"][0]
     if env in ("ant", "brax_ant"):
@@ -111,23 +94,9 @@ def draw(table: Table, path: Path) -> None:
 
 
 def details(table: Table) -> list[str]:
-    lines = [
-        "| algorithm | seeds | env steps | last return: mean ± sd (95 % interval of the mean) | best | velocity, m/s |",
-        "|---|---|---|---|---|---|",
-    ]
-    for algo in dict.fromkeys(table["algo"].tolist()):
-        found = evaluations(table, algo)
-        assert found is not None
-        steps, returns = found
-        speed = evaluations(table, algo, "eval_forward_velocity")
-        final = returns[:, -1]
-        mean, half = mean_interval(final)
-        interval = f" ± {final.std(ddof=1):.0f} ({mean - half:.0f} to {mean + half:.0f})" if len(final) > 1 else ""
-        lines.append(
-            f"| {figures.NAMES[algo]} | {len(final)} | {int(steps[-1]):,} | {mean:.0f}{interval} | "
-            f"{returns.mean(axis=0).max():.0f} | {'—' if speed is None else f'{speed[1][:, -1].mean():.2f}'} |"
-        )
-    return lines
+    algos = dict.fromkeys(table["algo"].tolist())
+    rows = [[figures.NAMES[algo], *evaluations.row(table.where(algo=algo))] for algo in algos]
+    return evaluations.table(("algorithm", *evaluations.HEAD), rows)
 
 
 STUDY = Study(
@@ -144,7 +113,7 @@ STUDY = Study(
     details=details,
     keep=("eval_*",),
     evaluations=True,
-    options={"env": None, "algos": ["matd3", "maddpg", "iltd3", "td3"]},
+    options={"env": None, "recipe": "fast", "algos": ["matd3", "maddpg", "iltd3", "td3"]},
     check=check,
     place=place,
     data="curves.csv",

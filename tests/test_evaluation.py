@@ -170,7 +170,9 @@ def test_training_does_not_depend_on_evaluation(monkeypatch):
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize(("every", "total", "steps"), [(None, 2000, 100), (0, 2000, 0), (70, 2000, 70), (None, 100, 5)])
+@pytest.mark.parametrize(
+    ("every", "total", "steps"), [(None, 4000, 200), (0, 2000, 0), (70, 2000, 70), (None, 100, 120)]
+)
 def test_evaluation_interval(every, total, steps):
     settings = {**SMALL, "eval_every": every, "total_steps": total}
     config = matd3_jax.config.load([f"{k}={'null' if v is None else v}" for k, v in settings.items()])

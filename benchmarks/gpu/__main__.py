@@ -10,6 +10,7 @@ Parts, in this order; docs/performance.md says what each takes:
     seeds       env steps/s over 1 to 1,024 seeds: whole loop, update, rollout
     precision   float32 products beside the device's own (TF32), wall_clock too
     ant         whole loop of six seeds over environments, its launches, the physics alone, mjx and mjx_fast
+    ant_wide    six seeds x 1M env steps of the Ant with recipe=wide, and what they learn
     unroll      longer bodies of the loops
     draws       random number generators, one draw a cycle
     options     command buffers, autotuning
@@ -22,7 +23,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from benchmarks.gpu import ant, checks, figure, floor, launches, seeds, targets, variants, wall_clock
+from benchmarks.gpu import ant, ant_wide, checks, figure, floor, launches, seeds, targets, variants, wall_clock
 from benchmarks.gpu.report import Report
 from benchmarks.gpu.stretch import Length
 from matd3_jax import command, config, devices
@@ -36,6 +37,7 @@ PARTS: dict[str, Callable[[Report, float, Length], None]] = {
     "seeds": seeds.run,
     "precision": variants.precision,
     "ant": ant.run,
+    "ant_wide": ant_wide.run,
     "unroll": variants.unroll,
     "draws": variants.draws,
     "options": variants.options,

@@ -13,7 +13,7 @@ def run(report: Report, scale: float, length: Length) -> None:
     """What decides about the target comes first: the loop with physics=mjx."""
     few = length._replace(cycles=min(length.cycles, 5))
     seeds = SEEDS if scale >= 1 else 1
-    # 20 environments are the wide schedule, a GPU's default.
+    # 20 environments are what HARL trains with.
     for num_envs in (128, 20, 1024) if scale >= 1 else (20,):
         report.case("ant", f"loop, mjx, {num_envs}", lambda n=num_envs: loop(seeds, n, few))
     # The same program as above, hence from the compilation cache.

@@ -76,7 +76,8 @@ class AlgoConfig:
 
     def algorithm(self) -> Algorithm:
         """What fixes the shape of the learner."""
-        derived: dict[str, Any] = {"smoothing": self.target_noise > 0, "noise_range": isinstance(self.exploration_noise, tuple)}
+        noise_range = isinstance(self.exploration_noise, tuple)
+        derived: dict[str, Any] = {"smoothing": self.target_noise > 0, "noise_range": noise_range}
         shared = {field.name for field in dataclasses.fields(Algorithm)} - set(derived)
         return Algorithm(**derived, **{name: getattr(self, name) for name in shared})
 

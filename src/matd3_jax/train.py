@@ -31,12 +31,13 @@ from matd3_jax.stopping import Stop
 from matd3_jax.trainer import TrainState
 from matd3_jax.training import Row, Training
 
-HELP = """usage: python -m matd3_jax.train [env=NAME] [algo=NAME] [adversary=NAME] [schedule=wide] [key=value ...]
+HELP = """usage: python -m matd3_jax.train [env=NAME] [algo=NAME] [adversary=NAME] [recipe=NAME] [key=value ...]
        python -m matd3_jax.train resume=RUN_DIR [checkpoint=STEP] [total_steps=N]
        python -m matd3_jax.train --cfg [key=value ...]     print the resolved settings and stop
 
 environments: {envs}
 algorithms:   {algos}
+recipes:      {recipes} (of robots; fast unless told otherwise)
 
 {processes}
 
@@ -55,6 +56,7 @@ def main(argv: Sequence[str]) -> int:
     if {"-h", "--help"} & set(argv):
         settings = (Path(__file__).parent / "conf" / "config.yaml").read_text()
         names = {"envs": ", ".join(config.known_names("env")), "algos": ", ".join(config.known_names("algo"))}
+        names["recipes"] = ", ".join(config.known_names("recipe"))
         print(HELP.format(settings=settings.split("\n\n", 2)[2], processes=cluster.HELP, **names))
         return 0
     if "--cfg" in argv:
@@ -197,8 +199,11 @@ def _robot_lines(training: Training) -> list[str]:
     """What is chosen for robots alone: the recipe of the settings, and the engine."""
     lines, recipe = [], getattr(training.config, "recipe", None)
     if recipe is not None and "forward_velocity" in training.env.measures:
-        other = "" if recipe == "paper" else "; for the paper's settings: recipe=paper"
-        lines.append(f"recipe: {recipe}{other}")
+        others = {"paper": "for the paper's settings", "wide": "for many environments at a time"}
+        if not devices.accelerated():
+            del others["wide"]
+        told = "".join(f"; {what}: recipe={name}" for name, what in others.items() if name != recipe)
+        lines.append(f"recipe: {recipe}{told}")
     physics = getattr(cost.innermost(training.env), "physics", None)
     if physics is not None:
         meaning = ENGINES.get(str(physics))
