@@ -1,10 +1,11 @@
 """Robots through the whole loop: shared rewards, evaluations with measures, single-agent baselines."""
 
+import jax
 import numpy as np
 import pytest
 
 import matd3_jax
-from matd3_jax import config
+from matd3_jax import checkpoint, config
 from matd3_jax.training import Training
 
 pytestmark = pytest.mark.usefixtures("quick_jit")
@@ -51,3 +52,39 @@ def test_agents_see_what_their_split_says(overrides, observations, actions):
     assert training.spec.observation_sizes == observations
     assert tuple(space.size for space in training.spec.action_spaces) == actions
     assert training.team_weights("agents").sum() == 1
+
+
+OPTIONS = (
+    *SMALL, "algo.exploration_noise=[0.05,0.4]", "algo.actor_average=0.1", "n_step=3", "shared_minibatch=true",
+    "num_envs=4", "batch_size=32", "env.episode_length=9", "log_every=80", "diagnostics.q_bias=true",
+    "diagnostics.q_bias_steps=5", "diagnostics.q_bias_rollouts=6", "eval_every=80",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("env", "seeds"), [("ant", 3), ("humanoid", 1)])
+def test_a_resumed_robot_goes_on_to_the_bit(env, seeds, tmp_path):
+    """With C physics, whatever carries state: the solver's start, noise quantiles, averaged actors, the reservoir."""
+    settings = config.load([f"env={env}", "env.physics=c", *OPTIONS, f"seeds={seeds}", "total_steps=400"])
+
+    def go_on(training, state):
+        rows = []
+        for _ in range(2):
+            state, row = training.advance(state)
+            rows.append(row)
+        return state, rows
+
+    first = Training(settings)
+    state, _ = first.start()
+    state, _ = first.advance(state)
+    checkpoint.save(tmp_path, first.step(state), first.trainer, state, keep=1)
+    whole, rows = go_on(first, state)
+    second = Training(settings)
+    resumed, others = go_on(second, checkpoint.restore(checkpoint.verify(tmp_path), second.trainer))
+    for a, b in zip(jax.tree.leaves(whole._replace(key=())), jax.tree.leaves(resumed._replace(key=())), strict=True):
+        np.testing.assert_array_equal(a, b)
+    for row, other in zip(rows, others, strict=True):
+        assert row.keys() == other.keys()
+        for name in row:
+            np.testing.assert_array_equal(row[name], other[name], err_msg=name)
+    assert np.isfinite(rows[-1]["agent_0_q_true"]).all() and np.isfinite(rows[-1]["eval_return_agents"]).all()
+    assert any("noise_quantile" in jax.tree_util.keystr(p) for p, _ in jax.tree_util.tree_leaves_with_path(whole))
