@@ -97,9 +97,11 @@ def write(data: Data, table: Path, facts: Path) -> None:
 
 
 def key_values(keys: Mapping[str, str], settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of a setting's columns; the opponents have the team's algorithm where none of their own was chosen."""
+    """The values of a setting's columns (a list as its text); the opponents have the team's algorithm where none of
+    their own was chosen."""
     flat = _flat(settings)
-    return {column: flat[path] for column, path in keys.items()}
+    found = {column: flat[path] for column, path in keys.items()}
+    return {column: str(value) if isinstance(value, list) else value for column, value in found.items()}
 
 
 def differences(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:

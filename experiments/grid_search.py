@@ -32,7 +32,7 @@ BEST = {"particle": {"lr": 0.01, "batch": 1000, "d": 2}, "ant": {"lr": 0.001, "b
 SCALES = {
     ("particle", "paper"): ["env=simple_spread", "seeds=4", "total_steps=1500000", "log_every=12500", "eval_every=0"],
     ("particle", "small"): ["env=simple_spread", "seeds=2", "total_steps=150000", "log_every=3000", "eval_every=0"],
-    ("ant", "paper"): ["env=ant", "seeds=3"],
+    ("ant", "paper"): ["env=ant", "recipe=paper", "seeds=3"],
 }
 
 

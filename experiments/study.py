@@ -224,6 +224,11 @@ def _merged(line: Sequence[str], overrides: Sequence[str]) -> list[str]:
     return [*(text for text in line if text.split("=")[0] not in keys), *overrides]
 
 
+def key_values(keys: Mapping[str, str], line: Sequence[str]) -> dict[str, Any]:
+    """The values of a setting's columns, from its overrides."""
+    return collecting.key_values(keys, _load(tuple(line)).to_dict())
+
+
 @functools.cache
 def _load(overrides: tuple[str, ...]) -> Config:
     return config.load(overrides)

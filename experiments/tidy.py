@@ -37,7 +37,13 @@ class Table:
         """The rows with these values: all rows of one setting, say."""
         chosen = np.ones(len(self), bool)
         for name, value in keys.items():
-            chosen &= self.columns[name] == value if name in self.columns else False
+            column = self.columns.get(name)
+            if column is None:
+                chosen[:] = False
+            elif column.dtype.kind == "U":  # also where numbers stand beside texts
+                chosen &= column == (value if isinstance(value, str) else f"{value:g}")
+            else:
+                chosen &= column == value
         return self.take(chosen)
 
     def take(self, chosen: np.ndarray) -> "Table":

@@ -339,7 +339,7 @@ def test_words(text, want):
         (["algo.lr=0.003", "algo.lr=0.001", ""], ["lr=0.003", "lr=0.001", "lr=0.01"]),
         # What the name of an algorithm or of an environment brings along goes without saying; other values do not.
         (["algo=matd3", "algo=maddpg", "algo=iltd3"], ["matd3", "maddpg", "iltd3"]),
-        (["env=ant schedule=paper", "env=simple_tag"], ["ant", "simple_tag"]),
+        (["env=ant recipe=paper", "env=simple_tag"], ["ant", "simple_tag"]),
         (["", "algo=maddpg algo.lr=0.003"], ["matd3, lr=0.01", "maddpg, lr=0.003"]),
         (["", "algo=maddpg algo.policy_delay=3"], ["matd3, policy_delay=2", "maddpg, policy_delay=3"]),
         (["env=simple_spread env.num_agents=5", "env=simple_tag"], ["simple_spread, num_agents=5", "simple_tag"]),

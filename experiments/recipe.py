@@ -1,0 +1,147 @@
+"""`python -m experiments.recipe`: what each part of the fast recipe does for the Ant: parts changed one at a time.
+
+    python -m experiments.recipe [only=PATTERN] [seeds=4] [train=true] [key=value ...]
+
+The Ant in two halves, MATD3, 200,000 env steps. Every setting is the base with one thing changed, and is compared with
+the base by the mean of its evaluations in the last third.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments import evaluations, figures, study, verdict
+from experiments.squashing import COMMON
+from experiments.study import Study
+from experiments.tidy import Table
+from experiments.verdict import Claim
+from matd3_jax import command
+
+BASE = "base"
+CHANGES: dict[str, list[str]] = {
+    BASE: [],
+    "noise range 0.05 to 0.4": ["algo.exploration_noise=[0.05,0.4]"],
+    "8 updates of 128": ["updates_per_collect=8", "batch_size=128"],
+    "n-step 5": ["n_step=5"],
+    "delay 1": ["algo.policy_delay=1"],
+    "normalized, deviation at least 0.1": ["normalise_observations=true", "normalise_least_deviation=0.1"],
+    "rewards scaled by 0.1": ["algo.reward_scale=0.1"],
+    "n-step 1": ["n_step=1"],
+    "a minibatch for each agent": ["shared_minibatch=false"],
+    "sigmoid": ["algo.actor_output=sigmoid"],
+    "noise 0.1": ["algo.exploration_noise=0.1"],
+}
+"""What differs from the base: tanh actors, learning rates 0.001, noise 0.2, n-step 3, delay 2, 4 updates of 256
+transitions that the agents share after 16 env steps."""
+
+KEYS = {
+    "actor_output": "algo.actor_output",
+    "exploration_noise": "algo.exploration_noise",
+    "updates": "updates_per_collect",
+    "batch_size": "batch_size",
+    "n_step": "n_step",
+    "policy_delay": "algo.policy_delay",
+    "shared_minibatch": "shared_minibatch",
+    "normalise_observations": "normalise_observations",
+    "reward_scale": "algo.reward_scale",
+}
+SCALES = {
+    "paper": ["seeds=4", "total_steps=200000", "log_every=10000"],
+    "small": ["seeds=2", "total_steps=60000", "log_every=5000"],
+}
+
+
+def settings(scale: str, options: Mapping[str, Any]) -> dict[str, list[str]]:
+    common = [*COMMON, *SCALES[scale], "algo.actor_output=tanh"]
+    lines = {}
+    for name, changes in CHANGES.items():
+        keys = {change.split("=")[0] for change in changes}
+        kept = [line for line in common if line.split("=")[0] not in keys]
+        lines[label(name)] = [*kept, *changes]
+    return lines
+
+
+def label(name: str) -> str:
+    """A name as that of a run directory."""
+    return name.replace(",", "").replace(" ", "_")
+
+
+def parts(table: Table) -> dict[str, Table]:
+    """The rows of each setting that is there, by its name in `CHANGES`."""
+    found = {}
+    for name, line in settings("paper", {}).items():
+        wanted = study.key_values(KEYS, line)
+        part = table.where(**{key: value for key, value in wanted.items() if key in table})
+        if len(part):
+            found[next(change for change in CHANGES if label(change) == name)] = part
+    return found
+
+
+def claims(table: Table) -> list[Claim]:
+    there = parts(table) if len(table) else {}
+    found = {name: evaluations.late(there[name]) if name in there else None for name in CHANGES}
+    return [
+        verdict.compare(
+            f"{name} instead of the base's makes no difference",
+            "mean evaluation in the last third",
+            (name, found[name]),
+            (BASE, found[BASE]),
+            kind="no difference",
+            margin=100.0,
+        )
+        for name in CHANGES
+        if name != BASE
+    ]
+
+
+def draw(table: Table, path: Path) -> None:
+    there = {name: evaluations.late(part) for name, part in parts(table).items()}
+    figure, (axis,) = figures.canvas(1, width=7.0, height=0.5 + 0.4 * len(there))
+    for place, (name, values) in enumerate(reversed(list(there.items()))):
+        assert values is not None
+        mean, half = verdict.mean(values).estimate, 0.0
+        if len(values) > 1:
+            half = (verdict.mean(values).high - verdict.mean(values).low) / 2
+        colour = figures.SERIES[1 if name == BASE else 0]
+        axis.errorbar(mean, place, xerr=half, fmt="o", color=colour, capsize=3)
+        axis.plot(values, np.full(len(values), place) + 0.2, ".", color="black", markersize=3, alpha=0.5)
+    axis.set_yticks(range(len(there)), [f"{name} ({figures.count(len(there[name]))})" for name in reversed(there)])
+    axis.set_xlabel("mean evaluation return in the last third, mean and its 95 % interval over seeds")
+    axis.set_title("Ant, two halves, MATD3, 200,000 env steps: one part changed at a time", fontsize=10)
+    figures.save(figure, path)
+
+
+def details(table: Table) -> list[str]:
+    rows = [
+        [name, figures.interval(evaluations.late(part)), *evaluations.row(part)] for name, part in parts(table).items()
+    ]
+    return evaluations.table(("changed", "mean in the last third", *evaluations.HEAD), rows)
+
+
+STUDY = Study(
+    name="recipe",
+    title="Parts of the fast recipe",
+    help=str(__doc__),
+    protocol="Ours, not the paper's: the base has tanh actors, learning rates of 0.001, noise 0.2, n-step 3, delay 2, "
+    "and 4 updates of 256 transitions, which the agents share, after every 16 env steps; four seeds, 200,000 env "
+    "steps; five deterministic episodes every 50,000.",
+    settings=settings,
+    keys=KEYS,
+    claims=claims,
+    draw=draw,
+    details=details,
+    keep=("eval_*",),
+    evaluations=True,
+    data="curves.csv",
+    figure="parts.png",
+)
+
+
+def main(argv: Sequence[str]) -> int:
+    return study.main(STUDY, argv)
+
+
+if __name__ == "__main__":
+    command.run(main)

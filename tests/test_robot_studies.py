@@ -1,0 +1,75 @@
+"""The studies of robots on made-up evaluations: which rows belong to which setting, and what is claimed of them."""
+
+import numpy as np
+import pytest
+
+from experiments import evaluations, recipe, robots, squashing, study, tidy
+from experiments.tidy import Table
+
+STEPS = np.array([0, 50_000, 100_000, 150_000, 200_000, 250_000, 300_000])
+SEEDS = 4
+
+
+def table_of(module, levels):
+    """Evaluations of the settings of a study: each rises to its level (by label), seeds 10 apart."""
+    parts = []
+    for label, line in module.settings("paper", {}).items():
+        if label not in levels:
+            continue
+        keys = study.key_values(module.STUDY.keys, line)
+        for seed in range(SEEDS):
+            rows = {key: np.full(len(STEPS), value) for key, value in keys.items()}
+            rows |= {"seed": np.full(len(STEPS), seed), "step": STEPS}
+            returns = levels[label] * STEPS / STEPS[-1] + 10 * (seed - 1.5)
+            parts.append(Table({**rows, evaluations.RETURN: returns, evaluations.VELOCITY: returns / 1000}))
+    return tidy.concatenate(parts)
+
+
+def words(claims):
+    return [claim.verdict for claim in claims]
+
+
+@pytest.mark.parametrize("module", [squashing, robots, recipe])
+def test_tables_survive_their_file_and_every_setting_is_drawn(module, tmp_path):
+    """Numbers beside texts in a column (a noise, a range of noise) are told apart after reading, too."""
+    labels = list(module.settings("paper", {}))
+    table = table_of(module, {label: 1000.0 + 100 * k for k, label in enumerate(labels)})
+    tidy.write(table, tmp_path / "curves.csv")
+    again = tidy.read(tmp_path / "curves.csv")
+    for t in (table, again):
+        assert len(module.details(t)) == 2 + len(labels)
+        module.STUDY.draw(t, tmp_path / "figure.png")
+        for k, (label, line) in enumerate(module.settings("paper", {}).items()):
+            part = t.where(**study.key_values(module.STUDY.keys, line))
+            assert len(part) == SEEDS * len(STEPS), label
+            assert evaluations.curve(part)[1][:, -1].mean() == pytest.approx(1000 + 100 * k)
+    assert words(module.claims(Table({}))) == ["not yet run"] * len(module.claims(Table({})))
+
+
+def test_late_means_are_over_the_last_third():
+    table = table_of(squashing, {"tanh-0.001": 300.0})
+    # Evaluations at 250,000 and 300,000: 250 and 300, seeds 10 apart.
+    np.testing.assert_allclose(evaluations.late(table), 275 + 10 * (np.arange(SEEDS) - 1.5))
+
+
+def test_squashing():
+    """If it is the slope, a sigmoid with twice the learning rate is a tanh; if not, the sigmoid stays where it was."""
+    slope = {"tanh-0.0005": 900.0, "sigmoid-0.001": 900.0, "tanh-0.001": 1800.0, "sigmoid-0.002": 1800.0}
+    assert words(squashing.claims(table_of(squashing, slope))) == ["same", "same", "same"]
+    other = slope | {"sigmoid-0.002": 900.0}
+    assert words(squashing.claims(table_of(squashing, other))) == ["same", "same", "opposite"]
+
+
+def test_recipe():
+    """Each change is held against the base alone."""
+    base = {recipe.label(name): 1000.0 for name in recipe.CHANGES}
+    names = [name for name in recipe.CHANGES if name != recipe.BASE]
+    assert set(words(recipe.claims(table_of(recipe, base)))) == {"same"}
+    worse = base | {recipe.label(names[2]): 400.0}
+    found = words(recipe.claims(table_of(recipe, worse)))
+    assert found[2] == "opposite" and set(found[:2] + found[3:]) == {"same"}
+
+
+def test_robots():
+    assert words(robots.claims(table_of(robots, {"ant-4x2": 3000.0}))) == ["same"]
+    assert words(robots.claims(table_of(robots, {"ant-4x2": 2000.0}))) == ["opposite"]
