@@ -122,6 +122,21 @@ def test_update_equals_reference(name):
     assert (clipped > 0) == (p.spec.algorithms[0].clip != "none")
 
 
+@pytest.mark.parametrize("name", ["matd3", "box", "n-step", "tanh", "matd3-shared-sequential"])
+def test_large_minibatches_are_computed_alike(name, monkeypatch):
+    """The program that large minibatches get (a loop over agents, products that transpose) against the reference."""
+    monkeypatch.setattr(networks, "SMALL_BATCH", 0)
+    p = Program(CASES[name])
+    state, rows = p.inputs()
+    expected, losses, _ = p.reference(state, rows)
+    new, metrics = p(state, rows)
+    for agent, other in zip(p.agents(new), expected, strict=True):
+        got, want = numbers(agent), numbers(other)
+        for path in want:
+            np.testing.assert_allclose(got[path], want[path], rtol=TOLERANCE, atol=TOLERANCE, err_msg=path)
+    np.testing.assert_allclose(np.stack(metrics), losses, rtol=TOLERANCE, atol=TOLERANCE)
+
+
 def test_some_norms_are_clipped_and_some_are_not():
     """The comparison covers both sides of the clipping: 3 agents with 3 networks of 3 layers have 54 variables."""
     p, state, rows, _, _ = base("matd3")
