@@ -2,7 +2,7 @@
 
     python -m experiments.recipe [only=PATTERN] [seeds=4] [train=true] [key=value ...]
 
-The Ant in two halves, MATD3, 200,000 env steps. Every setting is the base with one thing changed, and is compared with
+The Ant in two halves, MATD3, 300,000 env steps. Every setting is the base with one thing changed, and is compared with
 the base by the mean of its evaluations in the last third.
 """
 
@@ -48,7 +48,7 @@ KEYS = {
     "reward_scale": "algo.reward_scale",
 }
 SCALES = {
-    "paper": ["seeds=4", "total_steps=200000", "log_every=10000"],
+    "paper": ["seeds=4", "total_steps=300000", "log_every=10000"],
     "small": ["seeds=2", "total_steps=60000", "log_every=5000"],
 }
 
@@ -109,7 +109,7 @@ def draw(table: Table, path: Path) -> None:
         axis.plot(values, np.full(len(values), place) + 0.2, ".", color="black", markersize=3, alpha=0.5)
     axis.set_yticks(range(len(there)), [f"{name} ({figures.count(len(there[name]))})" for name in reversed(there)])
     axis.set_xlabel("mean evaluation return in the last third, mean and its 95 % interval over seeds")
-    axis.set_title("Ant, two halves, MATD3, 200,000 env steps: one part changed at a time", fontsize=10)
+    axis.set_title("Ant, two halves, MATD3, 300,000 env steps: one part changed at a time", fontsize=10)
     figures.save(figure, path)
 
 
@@ -125,7 +125,7 @@ STUDY = Study(
     title="Parts of the fast recipe",
     help=str(__doc__),
     protocol="Ours, not the paper's: the base has tanh actors, learning rates of 0.001, noise 0.2, n-step 3, delay 2, "
-    "and 4 updates of 256 transitions, which the agents share, after every 16 env steps; four seeds, 200,000 env "
+    "and 4 updates of 256 transitions, which the agents share, after every 16 env steps; four seeds, 300,000 env "
     "steps; five deterministic episodes every 50,000.",
     settings=settings,
     keys=KEYS,
