@@ -39,7 +39,7 @@ transitions that the agents share after 16 env steps."""
 KEYS = {
     "actor_output": "algo.actor_output",
     "exploration_noise": "algo.exploration_noise",
-    "updates": "updates_per_collect",
+    "updates_per_collect": "updates_per_collect",
     "batch_size": "batch_size",
     "n_step": "n_step",
     "policy_delay": "algo.policy_delay",

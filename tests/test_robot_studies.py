@@ -19,7 +19,7 @@ def table_of(module, levels):
         keys = study.key_values(module.STUDY.keys, line)
         for seed in range(SEEDS):
             rows = {key: np.full(len(STEPS), value) for key, value in keys.items()}
-            rows |= {"seed": np.full(len(STEPS), seed), "step": STEPS}
+            rows |= {"seed": np.full(len(STEPS), seed), "step": STEPS, "updates": STEPS // 4}
             returns = levels[label] * STEPS / STEPS[-1] + 10 * (seed - 1.5)
             parts.append(Table({**rows, evaluations.RETURN: returns, evaluations.VELOCITY: returns / 1000}))
     return tidy.concatenate(parts)
