@@ -1,4 +1,4 @@
-"""Exploration noise from a range: a scale for each environment and agent, kept for an episode and drawn anew after."""
+"""Exploration noise from a range: a scale for each environment and agent, kept for an episode and drawn again after it."""
 
 import dataclasses
 
@@ -55,7 +55,7 @@ def test_the_scale_is_where_the_quantile_says_for_a_whole_episode(collected):
         assert abs(values.std() - 1) < 5 / np.sqrt(2 * values.size)
 
 
-def test_scales_are_drawn_anew_for_the_next_episode_and_uniformly(collected):
+def test_scales_are_drawn_again_for_the_next_episode_and_uniformly(collected):
     start, end, _ = collected
     for quantile in (start, end):
         assert quantile.shape == (ENVS, 2)

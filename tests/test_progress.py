@@ -88,7 +88,7 @@ def test_without_evaluations_and_without_measures(begin, capsys):
 
 
 def test_rates_are_the_trainings(begin, capsys):
-    """Neither compiling nor evaluations slow them down; what evaluations take is told, and is in the time left."""
+    """Neither compiling nor evaluations slow them down; the share of evaluations is shown, and is in the time left."""
     bar = begin(row(0))
     assert bar.rates() == {}
     bar.spend(training=10, compiling=60)

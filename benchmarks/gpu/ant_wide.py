@@ -17,7 +17,7 @@ COLUMNS = ("seed", "step", "updates", *evaluations.COLUMNS)
 
 
 def run(report: Report, scale: float, length: Length) -> None:
-    """Rates first, by `stretch`'s way of measuring; then the training itself."""
+    """The whole training, as one case; `length` is of measurements that repeat."""
     del length
     report.case("ant_wide", "training", lambda: measure(report, scale))
 

@@ -143,7 +143,7 @@ def _c_rate(robot: Any, devices: tuple[jax.Device, ...], robots: int) -> float:
 
 
 def _repeated(program: Callable[[int], Any], wanted: float) -> tuple[int, float]:
-    """(how often, seconds) of a program that repeats its work as often as it is told to, for some `wanted` seconds.
+    """(how often, seconds) of a program that repeats its work as often as its argument says, for some `wanted` seconds.
 
     In short calls: on a busy machine one that was quick may take a thousand times as long the next time.
     """

@@ -54,7 +54,7 @@ products (`_matmul`), agents one after another without a loop (`learner.update`)
 
 
 def small_batch(rows: int) -> bool:
-    """Whether a minibatch of so many rows is a small one, and this is a CPU."""
+    """Whether a minibatch of `rows` transitions is a small one, and this is a CPU."""
     return rows <= SMALL_BATCH and jax.default_backend() == "cpu"
 
 

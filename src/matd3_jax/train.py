@@ -37,7 +37,7 @@ HELP = """usage: python -m matd3_jax.train [env=NAME] [algo=NAME] [adversary=NAM
 
 environments: {envs}
 algorithms:   {algos}
-recipes:      {recipes} (of robots; fast unless told otherwise)
+recipes:      {recipes} (of robots; fast by default)
 
 {processes}
 
@@ -202,8 +202,8 @@ def _robot_lines(training: Training) -> list[str]:
         others = {"paper": "for the paper's settings", "wide": "for many environments at a time"}
         if not devices.accelerated():
             del others["wide"]
-        told = "".join(f"; {what}: recipe={name}" for name, what in others.items() if name != recipe)
-        lines.append(f"recipe: {recipe}{told}")
+        hints = "".join(f"; {what}: recipe={name}" for name, what in others.items() if name != recipe)
+        lines.append(f"recipe: {recipe}{hints}")
     physics = getattr(cost.innermost(training.env), "physics", None)
     if physics is not None:
         meaning = ENGINES.get(str(physics))

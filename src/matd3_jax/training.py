@@ -29,8 +29,8 @@ Row = dict[str, np.ndarray]
 
 
 EVALUATION_SPACING = 4
-"""By default so many env steps of training at least for each env step of an evaluation, which costs no updates: some
-3 % of a robot's training with the fast recipe, less with others."""
+"""Env steps of training, at least, for each env step of an evaluation, by default. Evaluations cost no updates: they
+take some 3 % of a robot's training with the fast recipe, less with others."""
 
 
 @dataclasses.dataclass
