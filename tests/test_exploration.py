@@ -1,4 +1,4 @@
-"""Exploration noise from a range: a scale for each environment and agent, kept for an episode and drawn again after it."""
+"""Exploration noise from a range: a scale for each environment and agent, kept for an episode, then drawn again."""
 
 import dataclasses
 
