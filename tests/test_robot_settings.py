@@ -98,6 +98,7 @@ def test_an_accelerator_changes_the_engine_and_no_setting_of_learning(monkeypatc
     ("overrides", "message"),
     [
         (["recipe=wide"], "recipe=wide is for robots; simple_spread has the paper's settings only"),
+        (["env=ant", "schedule=wide"], "a robot's recipe has it"),
         (["env=ant", "recipe=wied"], "no recipe is called 'wied'; did you mean 'wide'?"),
         (["env=ant", "algo.exploration_noise=[0.3]"], "must be a number, or a range [low,high]"),
         (["env=ant", "algo.exploration_noise=[0.3,0.1]"], "must not end below its start"),

@@ -153,6 +153,8 @@ def load(overrides: Sequence[str] = ()) -> Config:
     Raises UserError, naming the key and the nearest valid ones, for whatever is not known or not possible.
     """
     parsed = parse(overrides)
+    if any(o.key_or_group == "schedule" for o in parsed):
+        raise UserError("there is no key 'schedule' any more: a robot's recipe has it (recipe=fast, paper or wide)")
     for group, noun in NOUNS.items():
         valid = known_names("algo" if group == "adversary" else group)
         for value in (o.value() for o in parsed if o.key_or_group == group):
