@@ -23,6 +23,7 @@ from matd3_jax.typed import plain, typed
 from matd3_jax.validation import check
 
 ADDED_TO_ALGO = {"actor_output": "sigmoid", "actor_average": 0.0, "reward_scale": 1.0}
+"""`ADDED_LATER` of an algorithm's group."""
 ADDED_LATER = {
     "recipe": "paper",
     "eval_every": 0,
@@ -272,8 +273,10 @@ def read(path: Path) -> Config:
         assert isinstance(found, dict)
         values = _with_defaults(found, ADDED_LATER)
         if "physics" in values["env"]:
+            from matd3_jax.envs.mjx.engine import RENAMED  # MuJoCo, which particle tasks do not need
+
             physics = values["env"]["physics"]
-            values["env"] = {**values["env"], "physics": {"exact": "mjx", "fast": "mjx_fast"}.get(physics, physics)}
+            values["env"] = {**values["env"], "physics": RENAMED.get(physics, physics)}
         return from_dict(values)
     except (OSError, AssertionError, ValueError, OmegaConfBaseException) as error:
         raise UserError(f"cannot read the configuration {path}: {_one_line(error)}") from error
