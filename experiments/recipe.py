@@ -24,6 +24,7 @@ CHANGES: dict[str, list[str]] = {
     BASE: [],
     "noise range 0.05 to 0.4": ["algo.exploration_noise=[0.05,0.4]"],
     "8 updates of 128": ["updates_per_collect=8", "batch_size=128"],
+    "2 updates of 512": ["updates_per_collect=2", "batch_size=512"],
     "n-step 5": ["n_step=5"],
     "delay 1": ["algo.policy_delay=1"],
     "normalized, deviation at least 0.1": ["normalise_observations=true", "normalise_least_deviation=0.1"],
