@@ -99,7 +99,7 @@ def claims(table: Table) -> list[Claim]:
 
 def draw(table: Table, path: Path) -> None:
     there = {name: evaluations.late(part) for name, part in parts(table).items()}
-    figure, (axis,) = figures.canvas(1, width=7.0, height=0.5 + 0.4 * len(there))
+    figure, (axis,) = figures.canvas(1, width=8.0, height=1.3 + 0.4 * len(there))
     for place, (name, values) in enumerate(reversed(list(there.items()))):
         assert values is not None
         mean, half = verdict.mean(values).estimate, 0.0
@@ -109,7 +109,8 @@ def draw(table: Table, path: Path) -> None:
         axis.errorbar(mean, place, xerr=half, fmt="o", color=colour, capsize=3)
         axis.plot(values, np.full(len(values), place) + 0.2, ".", color="black", markersize=3, alpha=0.5)
     axis.set_yticks(range(len(there)), [f"{name} ({figures.count(len(there[name]))})" for name in reversed(there)])
-    axis.set_xlabel("mean evaluation return in the last third, mean and its 95 % interval over seeds")
+    axis.set_xlabel("evaluations in the last third: mean and its 95 % interval over seeds")
+    axis.set_ylim(-0.6, len(there) - 0.4)
     axis.set_title("Ant, two halves, MATD3, 300,000 env steps: one part changed at a time", fontsize=10)
     figures.save(figure, path)
 
