@@ -7,6 +7,7 @@ import chex
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
 
 from matd3_jax.envs.base import ActionSpace, Box, Discrete, Simplex
 
@@ -68,18 +69,23 @@ def _matmul(x: chex.Array, kernel: chex.Array) -> chex.Array:
     return x @ kernel
 
 
-def _matmul_forward(x: chex.Array, kernel: chex.Array) -> tuple[chex.Array, tuple[chex.Array, chex.Array]]:
-    return x @ kernel, (x, kernel)
+def _matmul_forward(x, kernel):
+    # Kept is only what a wanted gradient needs: nobody asks for that of a minibatch.
+    return x.value @ kernel.value, (x.value if kernel.perturbed else None, kernel.value if x.perturbed else None)
 
 
-def _matmul_backward(kept: tuple[chex.Array, chex.Array], slope: chex.Array) -> tuple[chex.Array, chex.Array]:
+def _matmul_backward(kept, slope):
     x, kernel = kept
+    if isinstance(slope, SymbolicZero):
+        return None, None
+    x_slope = None if kernel is None else slope @ jnp.swapaxes(kernel, -1, -2)
+    if x is None:
+        return x_slope, None
     # The barrier keeps XLA from putting the transposition back into the product.
-    transposed = jax.lax.optimization_barrier(jnp.swapaxes(x, -1, -2))
-    return slope @ jnp.swapaxes(kernel, -1, -2), transposed @ slope
+    return x_slope, jax.lax.optimization_barrier(jnp.swapaxes(x, -1, -2)) @ slope
 
 
-_matmul.defvjp(_matmul_forward, _matmul_backward)
+_matmul.defvjp(_matmul_forward, _matmul_backward, symbolic_zeros=True)
 
 
 def _product(x: chex.Array, kernel: chex.Array) -> chex.Array:
