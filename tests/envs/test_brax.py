@@ -18,7 +18,7 @@ pytest.importorskip("brax")
 
 from matd3_jax.envs import brax_models as models  # noqa: E402
 from matd3_jax.envs.brax import BraxState  # noqa: E402
-from matd3_jax.envs.quiet import quiet  # noqa: E402
+from matd3_jax.envs.quiet import quiet, quiet_mujoco  # noqa: E402
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -45,7 +45,7 @@ def brax_env(robot, backend):
     """brax's own environment, made anew."""
     import brax.envs
 
-    with quiet():
+    with quiet(), quiet_mujoco():
         return brax.envs.get_environment(ROBOTS[robot][0], backend=backend)
 
 
