@@ -18,6 +18,7 @@ from experiments.study import Study
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax import command
+from matd3_jax.statistics import mean_interval
 
 BASE = "base"
 CHANGES: dict[str, list[str]] = {
@@ -71,18 +72,13 @@ def label(name: str) -> str:
 
 def parts(table: Table) -> dict[str, Table]:
     """The rows of each setting that is there, by its name in `CHANGES`."""
-    found = {}
-    for name, line in settings("paper", {}).items():
-        wanted = study.key_values(KEYS, line)
-        part = table.where(**{key: value for key, value in wanted.items() if key in table})
-        if len(part):
-            found[next(change for change in CHANGES if label(change) == name)] = part
-    return found
+    lines = zip(CHANGES, settings("paper", {}).values(), strict=True)
+    found = {name: table.where(**study.key_values(KEYS, line)) for name, line in lines}
+    return {name: part for name, part in found.items() if len(part)}
 
 
 def claims(table: Table) -> list[Claim]:
-    there = parts(table) if len(table) else {}
-    found = {name: evaluations.late(there[name]) if name in there else None for name in CHANGES}
+    found = dict.fromkeys(CHANGES) | {name: evaluations.late(part) for name, part in parts(table).items()}
     return [
         verdict.compare(
             f"{name} instead of the base's makes no difference",
@@ -102,9 +98,8 @@ def draw(table: Table, path: Path) -> None:
     figure, (axis,) = figures.canvas(1, width=8.0, height=1.3 + 0.4 * len(there))
     for place, (name, values) in enumerate(reversed(list(there.items()))):
         assert values is not None
-        mean, half = verdict.mean(values).estimate, 0.0
-        if len(values) > 1:
-            half = (verdict.mean(values).high - verdict.mean(values).low) / 2
+        mean, half = mean_interval(values)
+        half = half if len(values) > 1 else 0.0
         colour = figures.SERIES[1 if name == BASE else 0]
         axis.errorbar(mean, place, xerr=half, fmt="o", color=colour, capsize=3)
         axis.plot(values, np.full(len(values), place) + 0.2, ".", color="black", markersize=3, alpha=0.5)
