@@ -26,7 +26,9 @@ CHANGES: dict[str, list[str]] = {
     "noise range 0.05 to 0.4": ["algo.exploration_noise=[0.05,0.4]"],
     "8 updates of 128": ["updates_per_collect=8", "batch_size=128"],
     "2 updates of 512": ["updates_per_collect=2", "batch_size=512"],
+    "1 update of 1024": ["updates_per_collect=1", "batch_size=1024"],
     "n-step 5": ["n_step=5"],
+    "averaged actor": ["algo.actor_average=0.001"],
     "delay 1": ["algo.policy_delay=1"],
     "normalized, deviation at least 0.1": ["normalise_observations=true", "normalise_least_deviation=0.1"],
     "rewards scaled by 0.1": ["algo.reward_scale=0.1"],
@@ -40,6 +42,7 @@ transitions that the agents share after 16 env steps."""
 
 KEYS = {
     "actor_output": "algo.actor_output",
+    "actor_average": "algo.actor_average",
     "exploration_noise": "algo.exploration_noise",
     "updates_per_collect": "updates_per_collect",
     "batch_size": "batch_size",

@@ -263,6 +263,25 @@ def test_evaluate_prints_and_leaves_a_table(whole, capsys):
     assert (whole / "evaluation.csv").read_bytes() == before
 
 
+def test_evaluate_plays_the_online_actors_beside_the_averaged_ones(tmp_path):
+    """Averaging changes no training: the online actors are those of the same run without it."""
+    small = ["env=point_reach", "seeds=2", "algo.hidden=[8]", "batch_size=16", "learning_starts=100"]
+    found = {}
+    for name, average in (("averaged", 0.05), ("plain", 0.0)):
+        more = ["total_steps=400", "log_every=100", f"algo.actor_average={average}", f"out={tmp_path}", f"name={name}"]
+        assert train.main([*small, *more]) == 0
+        assert evaluate.main([f"run={tmp_path / name}", "episodes=5"]) == 0
+        with (tmp_path / name / "evaluation.csv").open(newline="") as file:
+            table = list(csv.DictReader(file))
+        for kind in dict.fromkeys(row["policy"] for row in table):
+            found[name, kind] = [float(row["mean"]) for row in table if row["policy"] == kind]
+    assert [kind for name, kind in found if name == "averaged"] == ["deterministic", "online", "sampled"]
+    assert [kind for name, kind in found if name == "plain"] == ["deterministic", "sampled"]
+    np.testing.assert_array_equal(found["averaged", "online"], found["plain", "deterministic"])
+    np.testing.assert_array_equal(found["averaged", "sampled"], found["plain", "sampled"])
+    assert found["averaged", "deterministic"] != found["plain", "deterministic"]
+
+
 BAD = {
     "run directory that exists": (["name=whole"], "is there already"),
     "unknown key": (["sedes=3"], "seeds"),

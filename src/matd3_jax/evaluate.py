@@ -15,12 +15,14 @@ from matd3_jax.errors import UserError
 from matd3_jax.rollout import Evaluation
 from matd3_jax.runs import RunDirectory
 from matd3_jax.statistics import mean_interval
+from matd3_jax.trainer import TrainState
 from matd3_jax.training import Training
 
 HELP = """usage: python -m matd3_jax.evaluate run=RUN_DIR [episodes=100] [seed=0] [checkpoint=STEP]
 
 Plays `episodes` episodes with every seed's policies, deterministic (no noise) and sampled (as in training), from the
-start states that `seed` gives; prints means over the episodes and writes every number to RUN_DIR/evaluation.csv."""
+start states that `seed` gives, with averaged actors (algo.actor_average) also deterministic with the online ones; prints
+means over the episodes and writes every number to RUN_DIR/evaluation.csv."""
 
 DEFAULTS: dict[str, Any] = {"run": None, "episodes": 100, "seed": 0, "checkpoint": None}
 
@@ -40,8 +42,11 @@ def main(argv: Sequence[str]) -> int:
     for heading in ("policy", "quantity", *(f"seed {settings.seed + i}" for i in range(settings.seeds)), "mean ± 95 %"):
         table.add_column(heading, justify="left" if heading in ("policy", "quantity") else "right")
     rows = []
-    for policy in ("deterministic", "sampled"):
-        found = training.evaluate(state, options["episodes"], policy == "deterministic", options["seed"])
+    policies = {"deterministic": state, "sampled": state}
+    if any(group.actor_average is not None for group in state.groups):
+        policies = {"deterministic": state, "online": _online(state), "sampled": state}
+    for policy, played in policies.items():
+        found = training.evaluate(played, options["episodes"], policy != "sampled", options["seed"])
         for quantity, by_episode in _quantities(training, found):
             by_seed = by_episode.mean(axis=1)
             mean, half = mean_interval(by_seed)
@@ -59,6 +64,11 @@ def main(argv: Sequence[str]) -> int:
         writer.writerow(("policy", "quantity", "seed", "mean", "std", "episodes"))
         writer.writerows(rows)
     return 0
+
+
+def _online(state: TrainState) -> TrainState:
+    """The state with its online actors in the place of the averaged ones."""
+    return state._replace(groups=tuple(group._replace(actor_average=None) for group in state.groups))
 
 
 def _quantities(training: Training, found: Evaluation) -> list[tuple[str, np.ndarray]]:
