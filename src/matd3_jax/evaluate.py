@@ -21,8 +21,8 @@ from matd3_jax.training import Training
 HELP = """usage: python -m matd3_jax.evaluate run=RUN_DIR [episodes=100] [seed=0] [checkpoint=STEP]
 
 Plays `episodes` episodes with every seed's policies, deterministic (no noise) and sampled (as in training), from the
-start states that `seed` gives, with averaged actors (algo.actor_average) also deterministic with the online ones; prints
-means over the episodes and writes every number to RUN_DIR/evaluation.csv."""
+start states that `seed` gives; with averaged actors (algo.actor_average) also deterministic with the online ones.
+Prints means over the episodes, and writes every number to RUN_DIR/evaluation.csv."""
 
 DEFAULTS: dict[str, Any] = {"run": None, "episodes": 100, "seed": 0, "checkpoint": None}
 
