@@ -68,15 +68,21 @@ def test_every_robot_has_every_recipe_and_the_fast_one_unless_told(env):
 
 
 def test_the_wide_recipe_replays_as_much_as_the_fast_one():
-    """As many replayed transitions for each env step, from a thousand environments or more."""
+    """As many replayed transitions for each env step, from a thousand environments or more; actors averaged over as
+    many env steps."""
     fast, wide = (config.load(["env=ant", f"recipe={name}"]) for name in ("fast", "wide"))
 
     def replayed(settings):
         return settings.updates_per_collect * settings.batch_size / (settings.num_envs * settings.rollout_length)
 
+    def averaged(settings):
+        steps_of_a_move = settings.num_envs * settings.algo.policy_delay / settings.updates_per_collect
+        return steps_of_a_move / settings.algo.actor_average
+
     assert replayed(wide) == replayed(fast)
+    assert averaged(wide) == averaged(fast) == 8000
     assert wide.num_envs >= 1024
-    assert wide.algo == fast.algo
+    assert dataclasses.replace(wide.algo, actor_average=fast.algo.actor_average) == fast.algo
 
 
 def test_given_values_win_over_the_recipe():
