@@ -74,10 +74,11 @@ def label(name: str) -> str:
 
 
 def parts(table: Table) -> dict[str, Table]:
-    """The rows of each setting that is there, by its name in `CHANGES`."""
+    """The rows of each setting that has been trained to the end, by its name in `CHANGES`."""
     lines = zip(CHANGES, settings("paper", {}).values(), strict=True)
     found = {name: table.where(**study.key_values(KEYS, line)) for name, line in lines}
-    return {name: part for name, part in found.items() if len(part)}
+    end = table["step"].max() if len(table) else 0
+    return {name: part for name, part in found.items() if len(part) and part["step"].max() > 0.99 * end}
 
 
 def claims(table: Table) -> list[Claim]:
@@ -109,7 +110,7 @@ def draw(table: Table, path: Path) -> None:
     axis.set_yticks(range(len(there)), [f"{name} ({figures.count(len(there[name]))})" for name in reversed(there)])
     axis.set_xlabel("evaluations in the last third: mean and its 95 % interval over seeds")
     axis.set_ylim(-0.6, len(there) - 0.4)
-    axis.set_title("Ant, two halves, MATD3, 300,000 env steps: one part changed at a time", fontsize=10)
+    figure.suptitle("Ant, two halves, MATD3, 300,000 env steps: one part changed at a time", fontsize=10)
     figures.save(figure, path)
 
 

@@ -2,7 +2,8 @@
 
     python -m experiments.robots [only=PATTERN] [seeds=3] [train=true] [key=value ...]
 
-One recipe for all of them. Beside the returns stand those of HARL's MATD3 (Zhong et al. 2024), read off its figures.
+One recipe for all of them; the Ant in two halves is in `experiments.ant`. Beside the returns stand those of HARL's MATD3
+(Zhong et al. 2024), read off its figures.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,7 +17,6 @@ from experiments.verdict import Claim
 from matd3_jax import command
 
 ROBOTS = {
-    ("ant", "halves"): None,
     ("ant", "2x4"): None,
     ("ant", "4x2"): "2,700 at 1M, 3,850 at 2M, 5,700 at 10M",
     ("half_cheetah", "2x3"): "4,300 ± 1,700 at 10M",
