@@ -18,8 +18,10 @@ from typing import Any  # noqa: E402
 
 import jax  # noqa: E402
 
-from matd3_jax import command, config, devices  # noqa: E402
-from matd3_jax.training import Training  # noqa: E402
+from matd3_jax import config  # noqa: E402
+from matd3_jax.cli import command  # noqa: E402
+from matd3_jax.runtime import devices  # noqa: E402
+from matd3_jax.training.session import Training  # noqa: E402
 
 EVENTS = {
     "/jax/core/compile/jaxpr_trace_duration": "trace",

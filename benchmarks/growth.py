@@ -22,8 +22,10 @@ import numpy as np
 
 from benchmarks import fresh, growth_figure
 from benchmarks.commit import commit
-from matd3_jax import command, config, devices
+from matd3_jax import config
+from matd3_jax.cli import command
 from matd3_jax.errors import UserError
+from matd3_jax.runtime import devices
 
 AXES: dict[str, list[int]] = {
     "seeds": [1, 2, 4, 8, 16, 32, 64],

@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, NullLocator
 
-from matd3_jax.plotting import COLOURS, PAPER
+from matd3_jax.figures.learning_curves import COLOURS, PAPER
 
 LABELS = {"seeds": "seeds", "agents": "agents", "replay": "transitions in each replay", "batch": "minibatch"}
 ORDERS = {"agents": (2, 3)}

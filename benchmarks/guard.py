@@ -21,8 +21,10 @@ import numpy as np
 from benchmarks import throughput
 from benchmarks.commit import commit
 from benchmarks.loop import Loop, copies_in
-from matd3_jax import command, config, devices
+from matd3_jax import config
+from matd3_jax.cli import command
 from matd3_jax.errors import UserError
+from matd3_jax.runtime import devices
 
 RECORDED = Path(__file__).with_suffix(".json")
 SETTINGS = ("env=simple_spread", "seeds=4", "replay_capacity=100000", "total_steps=100000", "eval_every=0")

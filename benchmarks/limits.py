@@ -27,10 +27,14 @@ import numpy as np
 
 from benchmarks.commit import commit
 from benchmarks.loop import product_flops
-from matd3_jax import command, config, devices, learner, memory
-from matd3_jax.spec import Group
-from matd3_jax.trainer import Trainer
-from matd3_jax.training import Training
+from matd3_jax import config
+from matd3_jax.cli import command
+from matd3_jax.core import update
+from matd3_jax.core.agents import Group
+from matd3_jax.runtime import devices
+from matd3_jax.training import memory
+from matd3_jax.training.loop import Trainer
+from matd3_jax.training.session import Training
 
 DEFAULTS: dict[str, Any] = {"seeds": 20, "repeats": 5, "out": None}
 
@@ -96,7 +100,7 @@ def products(trainer: Trainer, part: str = "loop") -> dict[Product, float]:
 
 
 def _update(trainer: Trainer, group: Group) -> Iterator[tuple[Product, float]]:
-    """(product, how many an update) of one agent of the group: see `learner._update_agent`."""
+    """(product, how many an update) of one agent of the group: see `update._update_agent`."""
     spec, algorithm = trainer.spec, group.algorithm
     batch = trainer.schedule.batch_size // trainer.devices_per_seed
     hidden, delay = algorithm.hidden, algorithm.policy_delay
@@ -107,7 +111,7 @@ def _update(trainer: Trainer, group: Group) -> Iterator[tuple[Product, float]]:
         sizes = (other.observation_size, *other.algorithm.hidden, other.action_space.size)
         members = (len(other.members),) if central else ()
         yield from ((part, 1 / shared) for part in _forward(members, batch, sizes))
-    critic = (learner.critic_input_size(spec, group), *hidden, 1)
+    critic = (update.critic_input_size(spec, group), *hidden, 1)
     twins = algorithm.num_critics
     forward = [*_wide(twins, batch, critic), *_forward((twins,), batch, critic)[1:]]
     yield from ((part, 2) for part in forward)  # targets, and the critics themselves

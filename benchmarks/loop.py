@@ -18,10 +18,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from matd3_jax import command, config, devices
+from matd3_jax import config
+from matd3_jax.cli import command
 from matd3_jax.config import Config
-from matd3_jax.trainer import Trainer
-from matd3_jax.training import Training
+from matd3_jax.runtime import devices
+from matd3_jax.training.loop import Trainer
+from matd3_jax.training.session import Training
 
 CYCLES = 2
 """Of one call of the compiled chunk: how many does not change the program but for a number."""

@@ -17,8 +17,10 @@ from typing import Any
 
 from benchmarks import throughput
 from benchmarks.commit import commit
-from matd3_jax import command, config, devices
+from matd3_jax import config
+from matd3_jax.cli import command
 from matd3_jax.errors import UserError
+from matd3_jax.runtime import devices
 
 DEFAULTS: dict[str, Any] = {
     "env": "ant",

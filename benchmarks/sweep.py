@@ -20,10 +20,13 @@ import jax
 import numpy as np
 
 from benchmarks.commit import commit
-from matd3_jax import command, config, devices, plan, sweep
+from matd3_jax import config
+from matd3_jax.cli import command, sweep
 from matd3_jax.config import Config
-from matd3_jax.search_space import SearchSpace
-from matd3_jax.training import Training
+from matd3_jax.runtime import devices
+from matd3_jax.sweep import batching
+from matd3_jax.sweep.search_space import SearchSpace
+from matd3_jax.training.session import Training
 
 DEFAULTS: dict[str, Any] = {"seeds": 4, "repeats": 5, "steps": 1200, "out": None}
 SWEPT = ("algo.lr=0.01,0.003,0.001", "algo.tau=0.01,0.005", "algo.policy_delay=1,2,3")
@@ -42,7 +45,7 @@ def main(argv: Sequence[str]) -> int:
     _, settings = sweep.read(overrides, None, 0)
     groups: dict[str, list[Config]] = {}
     for setting in settings.values():
-        groups.setdefault(plan.program(setting), []).append(setting)
+        groups.setdefault(batching.program(setting), []).append(setting)
     base = config.load(SearchSpace.parse(overrides).fixed)
     alone = [config.load([*SearchSpace.parse(overrides).fixed, f"seeds={len(settings) * base.seeds}"])]
     programs = [_Program(members, options["steps"]) for members in [alone, *groups.values()]]

@@ -26,10 +26,13 @@ import numpy as np
 
 from benchmarks import limits
 from benchmarks.commit import commit
-from matd3_jax import command, config, devices, networks, replay
+from matd3_jax import config
+from matd3_jax.cli import command
+from matd3_jax.core import networks, replay
 from matd3_jax.errors import UserError
-from matd3_jax.trainer import Trainer, TrainState
-from matd3_jax.training import Training
+from matd3_jax.runtime import devices
+from matd3_jax.training.loop import Trainer, TrainState
+from matd3_jax.training.session import Training
 
 DEFAULTS: dict[str, Any] = {"seeds": [1, 4, 20], "repeats": 5, "seconds": 1.0, "out": None}
 

@@ -26,7 +26,8 @@ from experiments import (
 )
 from experiments.study import RESULTS, Stopped, Study
 from experiments.tidy import Table
-from matd3_jax import command, config
+from matd3_jax import config
+from matd3_jax.cli import command
 from matd3_jax.envs.base import nearest
 from matd3_jax.errors import UserError
 

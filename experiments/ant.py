@@ -16,7 +16,8 @@ from experiments import evaluations, figures, study, verdict
 from experiments.study import RESULTS, Study
 from experiments.tidy import Table
 from experiments.verdict import Claim
-from matd3_jax import command, config
+from matd3_jax import config
+from matd3_jax.cli import command
 from matd3_jax.errors import UserError
 
 STANDING = 1000

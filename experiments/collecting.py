@@ -17,7 +17,7 @@ from experiments.tidy import Table
 from matd3_jax import config
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError
-from matd3_jax.runs import RunDirectory
+from matd3_jax.runs.directory import RunDirectory
 
 BOOKKEEPING = (
     *("out", "name", "seeds", "seed", "log_every", "checkpoint_every", "keep_checkpoints", "tensorboard"),

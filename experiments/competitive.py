@@ -14,7 +14,7 @@ from experiments import figures, study, tidy, verdict
 from experiments.study import Study
 from experiments.tidy import Table
 from experiments.verdict import Claim
-from matd3_jax import command
+from matd3_jax.cli import command
 
 ENVS = ("simple_crypto", "simple_push", "simple_adversary", "simple_tag")
 ALGOS = ("matd3", "maddpg")

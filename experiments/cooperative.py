@@ -13,7 +13,7 @@ from experiments import figures, study, tidy, verdict
 from experiments.study import Study
 from experiments.tidy import Table
 from experiments.verdict import Claim
-from matd3_jax import command
+from matd3_jax.cli import command
 
 ENVS = ("simple_spread", "simple_speaker_listener")
 ALGOS = ("matd3", "maddpg")

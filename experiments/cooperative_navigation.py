@@ -19,9 +19,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import matd3_jax
-from matd3_jax import command, config, devices
-from matd3_jax.plotting import curve
-from matd3_jax.statistics import welch_interval
+from matd3_jax import config
+from matd3_jax.cli import command
+from matd3_jax.figures.learning_curves import curve
+from matd3_jax.runtime import devices
+from matd3_jax.stats.intervals import welch_interval
 
 HERE = Path(__file__).parent
 ALGORITHMS = {"matd3": "MATD3", "maddpg": "MADDPG"}

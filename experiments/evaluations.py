@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 
 from experiments import figures
 from experiments.tidy import Table
-from matd3_jax.statistics import mean_interval
+from matd3_jax.stats.intervals import mean_interval
 
 RETURN, VELOCITY = "eval_return_agents", "eval_forward_velocity"
 COLUMNS = {RETURN: "return", VELOCITY: "forward velocity (m/s)"}

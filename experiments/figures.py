@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from experiments import tidy
 from experiments.tidy import Table
 from experiments.verdict import number
-from matd3_jax.statistics import mean_interval
+from matd3_jax.stats.intervals import mean_interval
 
 NAMES = {"matd3": "MATD3", "maddpg": "MADDPG", "iltd3": "IL-TD3", "td3": "SA-TD3", "iddpg": "IDDPG", "ddpg": "DDPG"}
 COLOURS = {  # Okabe and Ito's

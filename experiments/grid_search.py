@@ -15,9 +15,9 @@ from experiments import figures, study, tidy, verdict
 from experiments.study import RESULTS, Study
 from experiments.tidy import Table
 from experiments.verdict import Claim
-from matd3_jax import command
+from matd3_jax.cli import command
 from matd3_jax.errors import UserError
-from matd3_jax.statistics import mean_interval
+from matd3_jax.stats.intervals import mean_interval
 
 RATES = (0.01, 0.003, 0.001)
 GRIDS = {

@@ -15,7 +15,7 @@ from experiments.overestimation import measured
 from experiments.study import Study
 from experiments.tidy import Table
 from experiments.verdict import Claim
-from matd3_jax import command
+from matd3_jax.cli import command
 
 ALGOS = ("maddpg", "matd3")
 NUMBERS = {"paper": (2, 3, 4, 5, 6), "small": (2, 3, 4)}

@@ -17,8 +17,8 @@ from experiments.squashing import COMMON
 from experiments.study import Study
 from experiments.tidy import Table
 from experiments.verdict import Claim
-from matd3_jax import command
-from matd3_jax.statistics import mean_interval
+from matd3_jax.cli import command
+from matd3_jax.stats.intervals import mean_interval
 
 BASE = "base"
 CHANGES: dict[str, list[str]] = {

@@ -13,7 +13,7 @@ from experiments import evaluations, figures, study, verdict
 from experiments.study import Study
 from experiments.tidy import Table
 from experiments.verdict import Claim
-from matd3_jax import command
+from matd3_jax.cli import command
 
 GRID = (("sigmoid", 0.001), ("sigmoid", 0.002), ("tanh", 0.0005), ("tanh", 0.001))
 MARGIN = 300.0

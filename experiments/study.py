@@ -16,10 +16,12 @@ from experiments import collecting, verdict
 from experiments.collecting import Data
 from experiments.tidy import Table
 from experiments.verdict import Claim
-from matd3_jax import config, devices, sweeping
+from matd3_jax import config
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError
-from matd3_jax.sweeping import Stopped
+from matd3_jax.runtime import devices
+from matd3_jax.sweep import runner
+from matd3_jax.sweep.runner import Stopped
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -118,7 +120,7 @@ def run(study: Study, argv: Sequence[str]) -> list[Claim] | None:
         for label in missing:
             if (folder / "runs" / label / "config.yaml").exists():
                 collecting.check(folder / "runs" / label, wanted[label])
-        paths = sweeping.train(missing, folder)
+        paths = runner.train(missing, folder)
     changed = False
     for label, settings in wanted.items():
         if data.has(label, settings):

@@ -12,7 +12,7 @@ from experiments import figures, study, tidy, verdict
 from experiments.study import Study
 from experiments.tidy import Table
 from experiments.verdict import Claim
-from matd3_jax import command
+from matd3_jax.cli import command
 
 LEVELS = (0, 0.1, 0.2, 0.4)
 MARGIN = 0.05

@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from matd3_jax import config, encounter, envs
-from matd3_jax.normalisation import Statistics
-from matd3_jax.training import Training
+from matd3_jax import config, envs
+from matd3_jax.core.running_statistics import Statistics
+from matd3_jax.evaluation import cross_play
+from matd3_jax.training.session import Training
 
 STEPS, SEED = 5, 11
 SMALL = [
@@ -31,7 +32,7 @@ class Run(NamedTuple):
 
     def team(self, name):
         base = self.training.env.env if hasattr(self.training.env, "env") else self.training.env
-        return encounter.team_of(self.training, base, self.state, name)
+        return cross_play.team_of(self.training, base, self.state, name)
 
 
 def make(settings, env=None, number=0):
@@ -69,4 +70,4 @@ OWN = np.stack([np.arange(3)] * 2, axis=1)
 
 def meet(runs, one, two, pairs, episodes=4, deterministic=True, seed=SEED, env=ENV):
     teams = [runs[one].team("agents"), runs[two].team("adversaries")]
-    return encounter.play(env, teams, np.asarray(pairs), episodes, deterministic, seed)
+    return cross_play.play(env, teams, np.asarray(pairs), episodes, deterministic, seed)

@@ -10,17 +10,18 @@ import numpy as np
 import optax
 import reference
 
-from matd3_jax import config, learner, replay, returns
+from matd3_jax import config
+from matd3_jax.core import n_step, replay, update
+from matd3_jax.core.agents import Spec
 from matd3_jax.envs import Box, Simplex, make
 from matd3_jax.envs.joint import JointTeam
-from matd3_jax.spec import Spec
 
 BATCH = 7
 
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One configuration of `learner.update`; algorithms by name, `changes` of theirs by field."""
+    """One configuration of `update.update`; algorithms by name, `changes` of theirs by field."""
 
     env: str
     algo: str
@@ -143,7 +144,7 @@ CASES = {
 
 def random_state(spec, rng):
     """Groups whose every number is random: biases, moments, and targets that differ from the online networks."""
-    shapes = jax.eval_shape(lambda key: learner.init(spec, key), jax.random.key(0))
+    shapes = jax.eval_shape(lambda key: update.init(spec, key), jax.random.key(0))
 
     def fill(path, leaf):
         name = jax.tree_util.keystr(path)
@@ -172,7 +173,7 @@ def random_rows(spec, rng, batches, batch=BATCH):
 
 
 def drawn(spec, rows, hyper):
-    """What `returns.draw` gives for such rows, put into a replay as those of batches * batch environments."""
+    """What `n_step.draw` gives for such rows, put into a replay as those of batches * batch environments."""
     if spec.n_step == 1:
         return rows
     batches, batch, n, size = rows.shape
@@ -180,7 +181,7 @@ def drawn(spec, rows, hyper):
     ring = jnp.moveaxis(rows, 2, 0).reshape(1, n * num_envs, size)
     written = replay.Written(n * num_envs, n * num_envs, 1)
     gamma = jnp.array([hyper[spec.place(i)[0]].gamma for i in range(spec.num_agents)])
-    return returns.draw(spec, ring, 0, jnp.arange(num_envs).reshape(batches, batch), written, num_envs, gamma)
+    return n_step.draw(spec, ring, 0, jnp.arange(num_envs).reshape(batches, batch), written, num_envs, gamma)
 
 
 def layers(params, *place):

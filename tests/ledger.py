@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from matd3_jax.algorithms import HyperParams
+from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.envs import Environment, Simplex, TimeStep
 
 ENDS, LIMIT = 3, 5

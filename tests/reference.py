@@ -1,4 +1,4 @@
-"""One update of the paper in NumPy float64 with hand-written gradients: what `learner.update` is tested against.
+"""One update of the paper in NumPy float64 with hand-written gradients: what `update.update` is tested against.
 
 Written from the paper and the description of the authors' program, agent after agent and critic after critic; it knows
 nothing of jax, of groups or of stacked networks. Arrays are [batch, size]; a network is a list of (kernel, bias).

@@ -5,7 +5,7 @@ import numpy as np
 from experiments import tidy
 from experiments.tidy import Table
 from matd3_jax import config
-from matd3_jax.runs import RunDirectory
+from matd3_jax.runs.directory import RunDirectory
 
 NOISE = np.array([-1.0, 1.0, 0.5, -0.5])
 """Seeds about their mean."""

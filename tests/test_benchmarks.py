@@ -11,7 +11,7 @@ from benchmarks import compile_times, fresh, growth, growth_figure, guard, loop
 from benchmarks.loop import copies_in
 from matd3_jax import config
 from matd3_jax.errors import UserError
-from matd3_jax.training import Training
+from matd3_jax.training.session import Training
 
 
 def point(value, seconds, megabytes=10.0):

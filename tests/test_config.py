@@ -8,7 +8,7 @@ import pytest
 
 from matd3_jax import config, envs
 from matd3_jax.errors import UserError
-from matd3_jax.training import Training
+from matd3_jax.training.session import Training
 
 PAPER = {
     "actor_lr": 0.01,

@@ -7,8 +7,9 @@ import jax
 import pytest
 
 from benchmarks import limits
-from matd3_jax import config, cost
-from matd3_jax.training import Training
+from matd3_jax import config
+from matd3_jax.training import cost
+from matd3_jax.training.session import Training
 
 SMALL = ("total_steps=2000", "replay_capacity=200", "learning_starts=100", "batch_size=16", "seeds=2")
 ANT = ("env=ant", "num_envs=1", "rollout_length=1", "updates_per_collect=1", "algo.hidden=[400,300]")

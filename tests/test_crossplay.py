@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from cross_cases import SEED, SMALL, meet, runs
 
-from matd3_jax import checkpoint, config, crossplay
+from matd3_jax import config
+from matd3_jax.cli import crossplay
 from matd3_jax.errors import UserError
-from matd3_jax.paths import paths
-from matd3_jax.runs import RunDirectory
-from matd3_jax.training import Training
+from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.runs.paths import paths
+from matd3_jax.training import checkpoint
+from matd3_jax.training.session import Training
 
 pytestmark = pytest.mark.usefixtures("quick_jit")
 

@@ -2,7 +2,6 @@
 
 import csv
 import functools
-import importlib
 import json
 import os
 import re
@@ -20,13 +19,15 @@ import orbax.checkpoint as ocp
 import pytest
 from jax._src.clusters.slurm_cluster import SlurmCluster
 
-from matd3_jax import checkpoint, cluster, config, distributed, sweep, sweeping
-from matd3_jax.distributed import Processes
+from matd3_jax import config
+from matd3_jax.cli import sweep, train
 from matd3_jax.errors import UserError
-from matd3_jax.runs import RunDirectory
-from matd3_jax.training import Training
-
-train = importlib.import_module("matd3_jax.train")
+from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.runtime import multihost, slurm
+from matd3_jax.runtime.multihost import Processes
+from matd3_jax.sweep import runner
+from matd3_jax.training import checkpoint
+from matd3_jax.training.session import Training
 
 # A point mass, with evaluations and a ring that comes round on the way.
 TINY = [
@@ -68,22 +69,22 @@ def test_wrong_settings_get_one_line_and_leave_nothing(changed, words, tmp_path)
 
 
 def test_settings_name_a_cluster_also_on_slurm():
-    slurm = {"SLURM_STEP_NUM_TASKS": "4", "SLURM_STEP_NODELIST": "n1", "SLURM_JOB_ID": "1", "SLURM_PROCID": "0"}
-    for environ in ({}, slurm):
-        assert cluster.detect(GIVEN, environ) == ("10.0.0.1:1234", 2, 1, None)
-    assert cluster.detect(GIVEN | {"coordinator_address": "[::1]:80"}, {}).coordinator_address == "[::1]:80"
+    job = {"SLURM_STEP_NUM_TASKS": "4", "SLURM_STEP_NODELIST": "n1", "SLURM_JOB_ID": "1", "SLURM_PROCID": "0"}
+    for environ in ({}, job):
+        assert slurm.detect(GIVEN, environ) == ("10.0.0.1:1234", 2, 1, None)
+    assert slurm.detect(GIVEN | {"coordinator_address": "[::1]:80"}, {}).coordinator_address == "[::1]:80"
 
 
 def test_a_port_in_use_and_an_unknown_host_are_told_of(monkeypatch):
-    monkeypatch.setattr(cluster, "START_SECONDS", 0)
+    monkeypatch.setattr(slurm, "START_SECONDS", 0)
     with socket.create_server(("", 0)) as taken:
         address = f"localhost:{taken.getsockname()[1]}"
         with pytest.raises(UserError, match="cannot open port"):
-            cluster.look_for(address, first=True)
+            slurm.look_for(address, first=True)
     with pytest.raises(UserError, match="process 0 was not there within 0 s"):
-        cluster.look_for(address, first=False)
+        slurm.look_for(address, first=False)
     with pytest.raises(UserError, match="there is no host nowhere.invalid"):
-        cluster.look_for("nowhere.invalid:1234", first=False)
+        slurm.look_for("nowhere.invalid:1234", first=False)
 
 
 STEP = {
@@ -95,9 +96,9 @@ STEP = {
 
 def test_several_tasks_of_a_slurm_step_are_found():
     """4711 mod 4096 = 615, from 61440 on."""
-    assert cluster.detect({}, STEP) == ("node007:62055", 8, 5, None)
-    assert cluster.detect({}, STEP | {"JAX_COORDINATOR_PORT": "99"}).coordinator_address == "node007:99"
-    other = cluster.detect({}, STEP | {"SLURM_STEP_ID": "1"})
+    assert slurm.detect({}, STEP) == ("node007:62055", 8, 5, None)
+    assert slurm.detect({}, STEP | {"JAX_COORDINATOR_PORT": "99"}).coordinator_address == "node007:99"
+    other = slurm.detect({}, STEP | {"SLURM_STEP_ID": "1"})
     assert other.coordinator_address.startswith("node007:") and other.coordinator_address != "node007:62055"
 
 
@@ -106,7 +107,7 @@ def test_the_first_node_is_the_one_that_jax_finds(nodes, monkeypatch):
     monkeypatch.setenv("SLURM_JOB_ID", "4711")
     monkeypatch.setenv("SLURM_STEP_NODELIST", nodes)
     theirs = SlurmCluster.get_coordinator_address(None, None)
-    assert cluster.detect({}, STEP | {"SLURM_STEP_NODELIST": nodes}).coordinator_address == theirs
+    assert slurm.detect({}, STEP | {"SLURM_STEP_NODELIST": nodes}).coordinator_address == theirs
 
 
 def test_a_single_task_is_alone():
@@ -114,9 +115,9 @@ def test_a_single_task_is_alone():
     one = STEP | {"SLURM_NTASKS": "1", "SLURM_STEP_NUM_TASKS": "1"}
     script = {name: value for name, value in STEP.items() if "STEP" not in name}
     for environ in (one, script, {}):
-        assert cluster.detect({}, environ) is None
-    assert distributed.start({}) is distributed.ALONE
-    assert distributed.start(GIVEN | {"num_processes": "1", "process_id": "0"}) is distributed.ALONE
+        assert slurm.detect({}, environ) is None
+    assert multihost.start({}) is multihost.ALONE
+    assert multihost.start(GIVEN | {"num_processes": "1", "process_id": "0"}) is multihost.ALONE
 
 
 @pytest.mark.parametrize(
@@ -131,7 +132,7 @@ def test_a_single_task_is_alone():
     ],
 )
 def test_tasks_of_a_node_share_its_gpus_out(more, gpus):
-    assert cluster.detect({}, STEP | more).local_device_ids == gpus
+    assert slurm.detect({}, STEP | more).local_device_ids == gpus
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 7])
@@ -235,13 +236,13 @@ def test_other_settings_and_what_ends_one_end_all():
 # ---- a run and a sweep -----------------------------------------------------------------------------------------------
 
 WORKER = """
-import functools, importlib, json, os, signal, sys
+import functools, json, os, signal, sys
 import jax, optax
 options, stop, *arguments = sys.argv[1:]
 if options:
     jax.jit = functools.partial(jax.jit, compiler_options=json.loads(options))
-from matd3_jax import command
-from matd3_jax.training import Training
+from matd3_jax.cli import command, train
+from matd3_jax.training.session import Training
 advance = Training.advance
 def counted(self, state):
     state, row = advance(self, state)
@@ -249,7 +250,7 @@ def counted(self, state):
         os.kill(os.getpid(), signal.SIGTERM)
     return state, row
 Training.advance = counted
-sys.exit(command.code(importlib.import_module("matd3_jax.train").main, arguments))
+sys.exit(command.code(train.main, arguments))
 """
 
 
@@ -369,21 +370,19 @@ def test_a_sweep_shares_the_seeds_of_each_piece(tmp_path, monkeypatch):
         name: config.load([*more, f"algo.lr={lr}", f"algo.policy_delay={delay}", f"seeds={seeds}"])
         for name, lr, delay, seeds in (("a", 0.01, 1, 3), ("b", 0.1, 1, 1), ("c", 0.01, 2, 1))
     }
-    monkeypatch.setattr(sweeping.Stop, "__init__", lambda self: setattr(self, "signal", None))  # not in threads
+    monkeypatch.setattr(runner.Stop, "__init__", lambda self: setattr(self, "signal", None))  # not in threads
     monkeypatch.setattr(ocp, "StandardCheckpointer", OneAtATime)
-    monkeypatch.setattr(sweeping, "fitting_seeds", lambda settings, budget: 4)
+    monkeypatch.setattr(runner, "fitting_seeds", lambda settings, budget: 4)
 
     def work(processes):
-        made = sweeping.Sweep(tmp_path / str(processes.size), processes)
+        made = runner.Sweep(tmp_path / str(processes.size), processes)
         if processes.first:
             made.add(settings)
         processes.barrier()
         return made.train()
 
     assert together(2, work)[0] == [0, 0]
-    assert (
-        sweeping.Sweep(tmp_path / "2").pieces == [["a", "b"], ["c"]] and (tmp_path / "2/runs/c/summary.json").exists()
-    )
+    assert runner.Sweep(tmp_path / "2").pieces == [["a", "b"], ["c"]] and (tmp_path / "2/runs/c/summary.json").exists()
     del settings["c"]
     assert together(1, work)[0] == [0]
     assert {part.name for part in (tmp_path / "2/runs/a/checkpoints/400/state").iterdir()} == {"0", "2"}

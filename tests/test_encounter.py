@@ -11,8 +11,8 @@ from cross_cases import ENV, OWN, RUNS, SEED, SMALL, STEPS, make, meet, runs
 from learner_cases import layers
 from ledger import Ledger
 
-from matd3_jax import encounter
-from matd3_jax.pairings import pairs_of
+from matd3_jax.evaluation import cross_play
+from matd3_jax.evaluation.cross_play_table import pairs_of
 
 pytestmark = pytest.mark.usefixtures("quick_jit")
 
@@ -66,7 +66,7 @@ def test_own_pairs_are_evaluations(name):
     seeds = training.config.seeds
     played = meet(runs(), name, name, OWN[:seeds], episodes=6)
     found = training.evaluate(state, 6, True, SEED).episode_return.mean(axis=1)
-    for team in encounter.TEAMS:
+    for team in cross_play.TEAMS:
         weights = np.array(ENV.return_weights) * (np.array(ENV.teams) == team)
         np.testing.assert_allclose(played @ weights, found @ training.team_weights(team), rtol=1e-5, atol=1e-5)
 
@@ -101,8 +101,8 @@ def test_hard_choices_and_boxes():
     for actions in ("discrete", "continuous"):
         run = make([*SMALL, "algo=td3", "seeds=2", f"env.actions={actions}"])
         env = dataclasses.replace(ENV, actions=actions)
-        teams = [encounter.team_of(run.training, env, run.state, team) for team in encounter.TEAMS]
-        played = encounter.play(env, teams, OWN[:2], 4, True, SEED)
+        teams = [cross_play.team_of(run.training, env, run.state, team) for team in cross_play.TEAMS]
+        played = cross_play.play(env, teams, OWN[:2], 4, True, SEED)
         found = run.training.evaluate(run.state, 4, True, SEED).episode_return.mean(axis=1)
         np.testing.assert_allclose(played[:, 0], found[:, 0], rtol=1e-5, atol=1e-5)
         # The joined agent's reward is the mean of its members'.
@@ -115,7 +115,7 @@ def test_order_and_pieces(monkeypatch):
     together = meet(runs(), "mixed", "normal", pairs)
     for pair, row in zip(pairs, together, strict=True):
         np.testing.assert_allclose(meet(runs(), "mixed", "normal", [pair])[0], row, rtol=1e-5, atol=1e-5)
-    monkeypatch.setattr(encounter, "SIDE_BY_SIDE", {"cpu": 4})
+    monkeypatch.setattr(cross_play, "SIDE_BY_SIDE", {"cpu": 4})
     np.testing.assert_allclose(meet(runs(), "mixed", "normal", pairs), together, rtol=1e-5, atol=1e-5)
     assert len(np.unique(together.round(4), axis=0)) == 6
 

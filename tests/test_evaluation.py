@@ -12,7 +12,8 @@ from learner_cases import layers
 from ledger import ENDS, LIMIT, Ledger, by_hand
 
 import matd3_jax
-from matd3_jax import rollout, training
+from matd3_jax.core import rollout
+from matd3_jax.training import session
 
 SEEDS, EPISODES, CHUNK = 3, 6, 48
 SMALL = {
@@ -176,7 +177,7 @@ def test_training_does_not_depend_on_evaluation(monkeypatch):
 def test_evaluation_interval(every, total, steps):
     settings = {**SMALL, "eval_every": every, "total_steps": total}
     config = matd3_jax.config.load([f"{k}={'null' if v is None else v}" for k, v in settings.items()])
-    assert training.Training(config, Ledger()).eval_every == steps
+    assert session.Training(config, Ledger()).eval_every == steps
 
 
 def test_stops_when_all_episodes_have_ended():

@@ -9,7 +9,7 @@ import pytest
 from experiments import ant
 from matd3_jax import config
 from matd3_jax.errors import UserError
-from matd3_jax.runs import RunDirectory
+from matd3_jax.runs.directory import RunDirectory
 
 
 @pytest.fixture

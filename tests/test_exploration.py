@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from ledger import HYPER
 
-from matd3_jax import learner, rollout
-from matd3_jax.algorithms import Algorithm
+from matd3_jax.core import rollout, update
+from matd3_jax.core.agents import Spec
+from matd3_jax.core.algorithm import Algorithm
+from matd3_jax.core.rollout import Policy
 from matd3_jax.envs import make
-from matd3_jax.rollout import Policy
-from matd3_jax.spec import Spec
 
 ENVS, LENGTH, EPISODE = 500, 12, 6
 LOW, HIGH = 0.01, 0.05
@@ -31,7 +31,7 @@ def collected():
     algorithm = Algorithm(hidden=(4,), noise_range=True)
     spec = Spec.of(env, {"agents": algorithm})
     hyper = HYPER._replace(exploration_noise=LOW, exploration_noise_high=HIGH)
-    actors = tuple(jax.tree.map(jnp.zeros_like, g.actor) for g in learner.init(spec, jax.random.key(0)))
+    actors = tuple(jax.tree.map(jnp.zeros_like, g.actor) for g in update.init(spec, jax.random.key(0)))
     policy = Policy(actors, (hyper,) * len(spec.groups), None)
     start = rollout.start(env, jax.random.key(1), ENVS, rollout.ranged(spec))
     end, rows, _, _ = jax.jit(lambda s: rollout.collect(env, spec, policy, s, jax.random.key(2), LENGTH))(start)
@@ -81,7 +81,7 @@ def test_without_a_range_nothing_is_kept_and_nothing_changes():
     found = {}
     for ranged in (False, True):
         spec = Spec.of(env, {"agents": Algorithm(hidden=(4,), noise_range=ranged)})
-        groups = learner.init(spec, jax.random.key(0))
+        groups = update.init(spec, jax.random.key(0))
         hyper = HYPER._replace(exploration_noise=0.2, exploration_noise_high=0.2)
         policy = Policy(tuple(g.actor for g in groups), (hyper,) * len(groups), None)
         start = rollout.start(env, jax.random.key(1), 3, rollout.ranged(spec))
@@ -95,7 +95,7 @@ def test_outside_of_collecting_the_noise_is_in_the_middle_of_the_range():
     fixed, ranged = (
         Spec.of(env, {"agents": Algorithm(hidden=(4,), noise_range=noise_range)}) for noise_range in (False, True)
     )
-    actors = tuple(g.actor for g in learner.init(fixed, jax.random.key(0)))
+    actors = tuple(g.actor for g in update.init(fixed, jax.random.key(0)))
     observation = [jnp.ones((5, size)) for size in env.observation_sizes]
     middle = Policy(actors, (HYPER._replace(exploration_noise=0.3),), None)
     ends = Policy(actors, (HYPER._replace(exploration_noise=0.2, exploration_noise_high=0.4),), None)
@@ -112,7 +112,7 @@ def test_mixed_teams_keep_their_own_noise():
     env = make("simple_tag", actions="continuous")
     spec = Spec.of(env, algorithms)
     plain = Spec.of(env, {team: dataclasses.replace(a, noise_range=False) for team, a in algorithms.items()})
-    actors = tuple(g.actor for g in learner.init(spec, jax.random.key(0)))
+    actors = tuple(g.actor for g in update.init(spec, jax.random.key(0)))
     hyper = HYPER._replace(exploration_noise=0.2, exploration_noise_high=0.4)
     policy = Policy(actors, (hyper,) * len(spec.groups), None)
     observation = [jnp.ones((5, size)) for size in env.observation_sizes]

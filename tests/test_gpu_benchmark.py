@@ -9,9 +9,10 @@ from jax.profiler import ProfileData
 from benchmarks.gpu import launches, seeds, targets, wall_clock
 from benchmarks.gpu.report import Report
 from experiments.tidy import Table
-from matd3_jax import config, memory
+from matd3_jax import config
 from matd3_jax.errors import UserError
-from matd3_jax.training import Training
+from matd3_jax.training import memory
+from matd3_jax.training.session import Training
 
 # Times in us. Stream 7: 0-2 and 5-6; stream 8: 1-3, a copy 5.5-7.5. Together 0-3 and 5-7.5: 5.5 of 7.5. Line 3 shows
 # the same again by module; the host's plane is no device.

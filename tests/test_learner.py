@@ -10,7 +10,7 @@ import pytest
 import reference
 from learner_cases import BATCH, CASES, agents_of, drawn, numbers, random_rows, random_state
 
-from matd3_jax import learner, networks
+from matd3_jax.core import networks, update
 
 TOLERANCE = 1e-10
 """Absolute and relative, both sides in float64: sums of some hundred terms round at about 1e-14, Adam's division by
@@ -36,12 +36,12 @@ class Program:
         self.move = [self.spec.teams[group.members[0]] not in case.still for group in self.spec.groups]
         self.batches = 1 if case.shared else self.spec.num_agents
 
-        def update(state, rows):
+        def run(state, rows):
             key, options = jax.random.key(0), {"sequential": case.sequential, "one_by_one": case.one_by_one}
             rows = drawn(self.spec, rows, self.hyper)
-            return learner.update(self.spec, state, self.hyper, rows, key, self.move, **options)
+            return update.update(self.spec, state, self.hyper, rows, key, self.move, **options)
 
-        self.jitted = jax.jit(update)
+        self.jitted = jax.jit(run)
 
     def __call__(self, state, rows, known_noise=True):
         """Who samples or smooths gets the table's noise; whether there is noise at all stays the learner's choice."""
@@ -294,12 +294,12 @@ def test_draws_have_their_own_keys(monkeypatch):
     monkeypatch.setattr(jax.random, "gumbel", draw)
     monkeypatch.setattr(jax.random, "normal", draw)
 
-    def update(state, rows):
+    def run(state, rows):
         keys.clear()
-        learner.update(p.spec, state, p.hyper, rows, jax.random.key(1), p.move, sequential=True)
+        update.update(p.spec, state, p.hyper, rows, jax.random.key(1), p.move, sequential=True)
         return jnp.stack(keys)
 
-    p.jitted = jax.jit(update)
+    p.jitted = jax.jit(run)
     drawn = p(*p.inputs(), known_noise=False)
     assert len(np.unique(drawn, axis=0)) == len(drawn)
     # Three groups of central critics, two of them of choices: each has 2 samples and 3 smoothings of targets, and the

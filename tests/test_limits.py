@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks import limits
 from matd3_jax import config
-from matd3_jax.training import Training
+from matd3_jax.training.session import Training
 
 SMALL = ("total_steps=100", "replay_capacity=100", "learning_starts=100", "batch_size=16", "algo.hidden=[8,6]")
 

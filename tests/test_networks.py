@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import reference
 
-from matd3_jax import networks
+from matd3_jax.core import networks
 from matd3_jax.envs import Box, Discrete, MultiDiscrete, Simplex
 
 TOLERANCE = 1e-12  # float64 on both sides; only the order of sums of up to ten terms differs

@@ -10,13 +10,14 @@ import reference
 from learner_cases import layers
 from ledger import HYPER
 
-from matd3_jax import checkpoint, normalisation, rollout
-from matd3_jax.algorithms import Algorithm
+from matd3_jax.core import rollout, running_statistics
+from matd3_jax.core.agents import Spec
+from matd3_jax.core.algorithm import Algorithm
+from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.envs import make
-from matd3_jax.normalisation import Statistics
-from matd3_jax.schedule import Schedule
-from matd3_jax.spec import Spec
-from matd3_jax.trainer import Trainer
+from matd3_jax.training import checkpoint
+from matd3_jax.training.loop import Trainer
+from matd3_jax.training.schedule import Schedule
 
 SEEDS, CAPACITY = 3, 48
 ENV = make("point_reach", num_agents=2, dim=2)  # Box actions: without noise they are known from the observation
@@ -88,9 +89,9 @@ def test_float32_lasts():
     x = x.astype(np.float32)
 
     def step(statistics, inputs):
-        return normalisation.merge(statistics, *inputs), None
+        return running_statistics.merge(statistics, *inputs), None
 
-    got, _ = jax.jit(lambda x: jax.lax.scan(step, normalisation.initial(4), (x, jnp.arange(collects))))(x)
+    got, _ = jax.jit(lambda x: jax.lax.scan(step, running_statistics.initial(4), (x, jnp.arange(collects))))(x)
     flat = x.reshape(-1, 4).astype(np.float64)
     # In standard deviations (1e-4 for the constant one), where float32 itself resolves 1000 to 6e-5.
     error = np.abs(got.mean - flat.mean(axis=0)) / np.maximum(flat.std(axis=0), 1e-4)
@@ -102,19 +103,21 @@ def test_float32_lasts():
 def test_bounds():
     """Normalised values stop at +-10, constant entries give 0, and at the start nothing changes but for the bound."""
     statistics = Statistics(jnp.array([1.0, 0.5]), jnp.array([4.0, 0.0]))
-    got = normalisation.normalise(statistics, jnp.array([[3.0, 0.5], [100.0, 0.6], [-100.0, 0.4]]))
+    got = running_statistics.normalise(statistics, jnp.array([[3.0, 0.5], [100.0, 0.6], [-100.0, 0.4]]))
     np.testing.assert_allclose(got, [[1, 0], [10, 10], [-10, -10]], atol=1e-6)
     x = jnp.array([[-3.0, 0.7, 20.0]])
-    np.testing.assert_allclose(normalisation.normalise(normalisation.initial(3), x), [[-3.0, 0.7, 10.0]], rtol=1e-6)
+    np.testing.assert_allclose(
+        running_statistics.normalise(running_statistics.initial(3), x), [[-3.0, 0.7, 10.0]], rtol=1e-6
+    )
 
 
 def test_a_floor_keeps_small_what_hardly_ever_moves():
     """Deviations below the floor count as the floor, others as they are: of what networks read, not of what is kept."""
     statistics = Statistics(jnp.array([1.0, 0.5, 0.0]), jnp.array([4.0, 0.0, 1e-6]))
     x = jnp.array([[3.0, 0.6, 0.02]])
-    got = normalisation.normalise(normalisation.floored(statistics, 0.1), x)
+    got = running_statistics.normalise(running_statistics.floored(statistics, 0.1), x)
     np.testing.assert_allclose(got, [[1, 1, 0.2]], atol=1e-5)
-    assert normalisation.normalise(statistics, x)[0, 2] > 9
+    assert running_statistics.normalise(statistics, x)[0, 2] > 9
     t, state, _, _ = run()
     t.least_deviation = 0.4
     try:

@@ -8,8 +8,8 @@ import optax
 import pytest
 import reference
 
-from matd3_jax import optimiser
-from matd3_jax.algorithms import Algorithm
+from matd3_jax.core import optimizer
+from matd3_jax.core.algorithm import Algorithm
 
 TOLERANCE = 1e-12  # both sides in float64: only the order of sums of a few dozen terms differs
 
@@ -38,7 +38,7 @@ def test_clip(mode, stack):
     norms = [np.linalg.norm(leaf[place]) for leaf in gradients.values() for place in np.ndindex(stack)]
     bound = float(np.median(norms))
     with jax.enable_x64(True):
-        got = optimiser.clip(gradients, Algorithm(clip=mode), len(stack), bound)
+        got = optimizer.clip(gradients, Algorithm(clip=mode), len(stack), bound)
     too_large = 0
     for place in np.ndindex(stack):
         want, count = reference.clip(network(gradients, place), mode, bound)
@@ -53,10 +53,10 @@ def test_clip(mode, stack):
 def test_clip_of_nothing_and_of_a_norm_at_the_bound(mode):
     """Zero gradients stay zero (no 0 / 0), and a norm within the bound is left bit for bit."""
     zero = {"w": np.zeros((2, 3), np.float32)}
-    got = optimiser.clip(zero, Algorithm(clip=mode), 1, np.float32(0.5))
+    got = optimizer.clip(zero, Algorithm(clip=mode), 1, np.float32(0.5))
     np.testing.assert_array_equal(got["w"], zero["w"])
     small = {"w": np.array([[0.3, 0.4, 0.0], [3, 4, 0]], np.float32)}
-    got = optimiser.clip(small, Algorithm(clip=mode), 1, np.float32(0.5))
+    got = optimizer.clip(small, Algorithm(clip=mode), 1, np.float32(0.5))
     np.testing.assert_array_equal(got["w"][0], small["w"][0])
     np.testing.assert_allclose(got["w"][1], [0.3, 0.4, 0], rtol=1e-6)  # float32
 
@@ -72,8 +72,8 @@ def test_adam(kind):
     empty = [(np.zeros((3, 4)), np.zeros(4)), (np.zeros((4, 2)), np.zeros(2))]
     states = [reference.Adam(empty, empty, 0)] * 2
     with jax.enable_x64(True):
-        state = optimiser.adam(kind).init(jax.tree.map(jax.numpy.asarray, params))
-        step = jax.jit(lambda p, s, g: optimiser.apply(algorithm, p, s, g, 0.01, 0.5, 1))
+        state = optimizer.adam(kind).init(jax.tree.map(jax.numpy.asarray, params))
+        step = jax.jit(lambda p, s, g: optimizer.apply(algorithm, p, s, g, 0.01, 0.5, 1))
         for _ in range(10):
             gradients = stacked(rng, (2,), scale=1e-7)
             params, state = step(params, state, gradients)
@@ -98,9 +98,9 @@ def test_learning_rate_is_a_step_size():
     params = {"w": np.ones((2, 3), np.float32)}
     gradients = {"w": np.array([[0, 0, 0], [3, 4, 0]], np.float32)}
     algorithm = dataclasses.replace(Algorithm(), clip="variable")
-    state = optimiser.adam("standard").init(params)
+    state = optimizer.adam("standard").init(params)
     for lr in (0.01, 0.1):
-        moved, after = optimiser.apply(algorithm, params, state, gradients, lr, 0.5, 1)
+        moved, after = optimizer.apply(algorithm, params, state, gradients, lr, 0.5, 1)
         # Adam's first step is lr times the sign (float32; epsilon is 1e-8 / 0.3 of it).
         np.testing.assert_allclose(moved["w"], [[1, 1, 1], [1 - lr, 1 - lr, 1]], rtol=1e-6)
         np.testing.assert_allclose(after.mu["w"][1], [0.03, 0.04, 0], rtol=1e-6)

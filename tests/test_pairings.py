@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from matd3_jax.pairings import Pairings, pairs_of
-from matd3_jax.statistics import mean_interval
+from matd3_jax.evaluation.cross_play_table import Pairings, pairs_of
+from matd3_jax.stats.intervals import mean_interval
 
 
 def everybody(seeds, matched=False, rng=None):

@@ -8,9 +8,11 @@ import jax
 import numpy as np
 import pytest
 
-from matd3_jax import config, memory, plan
+from matd3_jax import config
 from matd3_jax.errors import UserError
-from matd3_jax.training import Training
+from matd3_jax.sweep import batching
+from matd3_jax.training import memory
+from matd3_jax.training.session import Training
 
 BASE = ["env=simple_push", "seeds=2", "algo.hidden=[8]", "batch_size=16", "num_envs=2", "learning_starts=200",
         "replay_capacity=500", "total_steps=1500"]  # fmt: skip
@@ -27,7 +29,7 @@ def load(*more: str) -> config.Config:
      "out=elsewhere"],
 )  # fmt: skip
 def test_hyper_parameters_and_seeds_share_a_program(override):
-    assert plan.program(load(override)) == plan.program(load())
+    assert batching.program(load(override)) == batching.program(load())
 
 
 @pytest.mark.parametrize(
@@ -37,7 +39,7 @@ def test_hyper_parameters_and_seeds_share_a_program(override):
      "diagnostics.q_bias=true", "adversary=maddpg", "algo=maddpg"],
 )  # fmt: skip
 def test_shapes_and_schedules_do_not(override):
-    assert plan.program(load(override)) != plan.program(load())
+    assert batching.program(load(override)) != batching.program(load())
 
 
 def test_settings_that_share_a_program_compile_to_the_same_text():
@@ -54,18 +56,18 @@ def test_settings_that_share_a_program_compile_to_the_same_text():
 
 def test_only_missing_seeds_are_planned(tmp_path):
     existing = {"a": load("seed=0", "seeds=3"), "other": load("algo.lr=0.1", "seeds=9"), "b": load("seed=5", "seeds=1")}
-    assert plan.missing(load("seeds=7"), existing) == (["a", "b"], [3, 4, 6])
-    pieces = plan.pieces({"new": load("seeds=7")}, existing, tmp_path, lambda config: 100)
+    assert batching.missing(load("seeds=7"), existing) == (["a", "b"], [3, 4, 6])
+    pieces = batching.pieces({"new": load("seeds=7")}, existing, tmp_path, lambda config: 100)
     assert [[(run.name, run.seed, run.seeds) for run in piece] for piece in pieces] == [
         [("new-seeds_3_to_4", 3, 2), ("new-seeds_6_to_6", 6, 1)]
     ]
-    assert plan.pieces({"new": load("seeds=3")}, existing, tmp_path, lambda config: 100) == []
+    assert batching.pieces({"new": load("seeds=3")}, existing, tmp_path, lambda config: 100) == []
     with pytest.raises(UserError, match="seed 2"):
-        plan.missing(load("seeds=7"), {**existing, "again": load("seed=2", "seeds=1")})
+        batching.missing(load("seeds=7"), {**existing, "again": load("seed=2", "seeds=1")})
 
 
 def test_seeds_that_do_not_fit_are_cut(tmp_path):
-    pieces = plan.pieces({"x": load("seeds=10"), "y": load("algo.lr=1", "seeds=3")}, {}, tmp_path, lambda config: 4)
+    pieces = batching.pieces({"x": load("seeds=10"), "y": load("algo.lr=1", "seeds=3")}, {}, tmp_path, lambda config: 4)
     runs = [run for piece in pieces for run in piece]
     assert all(sum(run.seeds for run in piece) <= 4 for piece in pieces)
     covered = [(run.algo.actor_lr, seed) for run in runs for seed in range(run.seed, run.seed + run.seeds)]
@@ -80,7 +82,7 @@ def test_packing_takes_no_more_pieces_than_needed():
         sizes = rng.integers(1, 5, rng.integers(1, 8))
         most = int(rng.integers(sizes.max(), 10))
         runs = [dataclasses.replace(load(), seeds=int(n), name=str(k)) for k, n in enumerate(sizes)]
-        found = plan.packed(runs, most)
+        found = batching.packed(runs, most)
         assert [run for piece in found for run in piece] == runs
 
         def fits(cuts, sizes=sizes, most=most):

@@ -9,10 +9,13 @@ import pytest
 import scipy.stats
 from matplotlib.figure import Figure
 
-from matd3_jax import config, curves, plot, plotting
-from matd3_jax.differences import label_differences
+from matd3_jax import config
+from matd3_jax.cli import plot
+from matd3_jax.config.diff import label_differences
 from matd3_jax.errors import UserError
-from matd3_jax.runs import RunDirectory, together
+from matd3_jax.figures import learning_curves
+from matd3_jax.runs import curves
+from matd3_jax.runs.directory import RunDirectory, together
 
 
 @functools.cache
@@ -141,9 +144,11 @@ def test_many_curves_can_be_told_apart(drawn, tmp_path):
     assert len(looks) == 12 and len(figure.legends) == 1 and axis.get_legend() is None
     assert axis.get_title() == "simple_spread, matd3"
     # No grey twins and no faint ones: each colour has contrast to white, and to its neighbours in the order of drawing.
-    luminance = [matplotlib.colors.to_rgb(colour) @ np.array([0.2126, 0.7152, 0.0722]) for colour in plotting.COLOURS]
+    luminance = [
+        matplotlib.colors.to_rgb(colour) @ np.array([0.2126, 0.7152, 0.0722]) for colour in learning_curves.COLOURS
+    ]
     assert max(luminance) < 0.75
-    assert len({(k % len(plotting.COLOURS), k % len(plotting.STYLES)) for k in range(35)}) == 35
+    assert len({(k % len(learning_curves.COLOURS), k % len(learning_curves.STYLES)) for k in range(35)}) == 35
 
 
 @pytest.mark.parametrize(("name", "begins"), [("a.png", b"\x89PNG"), ("a.pdf", b"%PDF"), ("a.svg", b"<?xml")])

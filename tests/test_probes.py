@@ -14,11 +14,11 @@ import reference
 from learner_cases import layers
 from ledger import HYPER
 
-from matd3_jax.algorithms import Algorithm
+from matd3_jax.core.agents import Spec
+from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.envs import Box, Environment, Simplex, TimeStep
-from matd3_jax.schedule import Schedule
-from matd3_jax.spec import Spec
-from matd3_jax.trainer import Trainer
+from matd3_jax.training.loop import Trainer
+from matd3_jax.training.schedule import Schedule
 
 GAMMA = 0.8
 ALGORITHMS = {

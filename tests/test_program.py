@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import pytest
 from ledger import HYPER
 
-from matd3_jax.algorithms import Algorithm
+from matd3_jax.core.agents import Spec
+from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.envs import make
-from matd3_jax.schedule import Schedule
-from matd3_jax.spec import Spec
-from matd3_jax.trainer import Trainer
+from matd3_jax.training.loop import Trainer
+from matd3_jax.training.schedule import Schedule
 
 CAPACITY = 6 * 1361  # a number that nothing else in the program has
 IN_PLACE = {"parameter", "get-tuple-element", "tuple", "bitcast", "dynamic-update-slice", "while", "call"}

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import matd3_jax
-from matd3_jax import clock, progress
-from matd3_jax.clock import Clock
-from matd3_jax.training import Training
+from matd3_jax.training import clock, progress
+from matd3_jax.training.clock import Clock
+from matd3_jax.training.session import Training
 
 NAN = np.full(2, np.nan)
 

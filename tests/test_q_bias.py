@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 import functools
-import importlib
 import json
 import re
 import shutil
@@ -18,19 +17,22 @@ import scipy.stats
 from learner_cases import layers
 from ledger import ENDS, HYPER, Ledger, LedgerState, by_hand
 
-from matd3_jax import checkpoint, config, learner, overestimation, q_bias
-from matd3_jax.algorithms import Algorithm
+from matd3_jax import config
+from matd3_jax.cli import train
+from matd3_jax.core import q_bias, update
+from matd3_jax.core.agents import Spec
+from matd3_jax.core.algorithm import Algorithm
+from matd3_jax.core.q_bias import Pairs, Values
+from matd3_jax.core.rollout import Policy
+from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.envs import make
 from matd3_jax.envs.point import PointState
 from matd3_jax.errors import UserError
-from matd3_jax.normalisation import Statistics
-from matd3_jax.q_bias import Pairs, Values
-from matd3_jax.rollout import Policy
-from matd3_jax.schedule import Schedule
-from matd3_jax.spec import Spec
-from matd3_jax.trainer import Trainer
-
-train = importlib.import_module("matd3_jax.train")  # the name in the package is the function
+from matd3_jax.figures import q_bias as q_bias_figure
+from matd3_jax.runs import overestimation
+from matd3_jax.training import checkpoint
+from matd3_jax.training.loop import Trainer
+from matd3_jax.training.schedule import Schedule
 
 MATD3 = Algorithm(hidden=(5,), policy_delay=1)  # or else the loop to compile is twice as long
 IDDPG = Algorithm(name="iddpg", hidden=(6,), num_critics=1, policy_delay=1, critic="own")
@@ -56,7 +58,7 @@ def pairs_of_ledger(number):
 
 @functools.cache
 def fresh(spec):
-    return jax.jit(lambda key: learner.init(spec, key))(jax.random.key(6))
+    return jax.jit(lambda key: update.init(spec, key))(jax.random.key(6))
 
 
 def policy_of_ledger(bias):
@@ -381,7 +383,7 @@ def test_lines_and_figure_of_any_number_of_seeds(seeds, tmp_path):
     assert ("200 rollouts)" if seeds == 1 else "2 seeds)") in head
     assert lines[0] == f"  a: estimate 3, truth 4, overestimation 6 ± {'7' if seeds == 1 else '0'}"
     path = tmp_path / "q_bias.png"
-    overestimation.draw(path, metrics, {"agents": ["a", "b"], "adversaries": ["c"]}, "title")
+    q_bias_figure.draw(path, metrics, {"agents": ["a", "b"], "adversaries": ["c"]}, "title")
     assert path.read_bytes()[:4] == b"\x89PNG"
     steps, values = overestimation.team_values(metrics, ["a", "b"], "q_true")
     np.testing.assert_array_equal(steps, [10, 30])

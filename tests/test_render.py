@@ -12,13 +12,15 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from matd3_jax import animation, checkpoint, config, episode, render, rendering
+from matd3_jax import config
+from matd3_jax.cli import render, train
 from matd3_jax.envs import Box, Environment, TimeStep, make
 from matd3_jax.envs.joint import JointTeam
 from matd3_jax.errors import UserError
-from matd3_jax.training import Training
-
-train = importlib.import_module("matd3_jax.train")  # the name in the package is the function
+from matd3_jax.evaluation import trajectory
+from matd3_jax.training import checkpoint
+from matd3_jax.training.session import Training
+from matd3_jax.video import encode, frames
 
 TINY = [
     "env=simple_push", "adversary=maddpg", "seeds=3", "seed=5", "algo.hidden=[8]", "adversary.hidden=[8]",
@@ -124,19 +126,19 @@ def test_the_episode_is_one_of_the_evaluation(trained):
     training, state = trained
     found = training.evaluate(state, 3, deterministic=True)
     for number in (0, 2):
-        played = episode.play(training, state, 1, number)
+        played = trajectory.play(training, state, 1, number)
         for team, i in (("adversaries", 0), ("agents", 1)):
             assert played.returns[team][-1] == pytest.approx(found.episode_return[1, number, i], rel=1e-3)
         assert played.length == 25 and played.truncated and not played.terminated
-    other = episode.play(training, state, 0, 0).states
-    assert np.any(other.pos[-1] != episode.play(training, state, 1, 0).states.pos[-1])
-    np.testing.assert_array_equal(other.pos[0], episode.play(training, state, 1, 0).states.pos[0])
+    other = trajectory.play(training, state, 0, 0).states
+    assert np.any(other.pos[-1] != trajectory.play(training, state, 1, 0).states.pos[-1])
+    np.testing.assert_array_equal(other.pos[0], trajectory.play(training, state, 1, 0).states.pos[0])
 
 
 def test_returns_and_states_belong_together(trained):
     """The return so far is the sum of the rewards of the states so far; noise changes what is played."""
     training, state = trained
-    played = episode.play(training, state, 0, 0)
+    played = trajectory.play(training, state, 0, 0)
     rewards = np.stack([training.env.reward(jax.tree.map(lambda x, t=t: x[t], played.states)) for t in range(1, 26)])
     np.testing.assert_allclose(np.diff(played.returns["agents"]), rewards[:, 1], rtol=1e-4, atol=1e-5)
     assert played.captions()[0] == "step 0   return: adversaries 0.0, agents 0.0"
@@ -145,7 +147,7 @@ def test_returns_and_states_belong_together(trained):
     some = played.at(7)
     assert some.step.tolist() == [0, 7, 14, 21, 25]
     np.testing.assert_array_equal(some.states.pos, np.asarray(played.states.pos)[some.step])
-    noisy = episode.play(training, state, 0, 0, deterministic=False).states.pos
+    noisy = trajectory.play(training, state, 0, 0, deterministic=False).states.pos
     np.testing.assert_array_equal(noisy[0], played.states.pos[0])
     assert np.abs(noisy[-1] - played.states.pos[-1]).max() > 1e-3
 
@@ -186,13 +188,13 @@ def own(quick_jit):
 
 
 def test_an_environment_that_draws_itself_and_terminates(own):
-    played = episode.play(own.training, own.state)
+    played = trajectory.play(own.training, own.state)
     assert played.length == 7 and played.terminated and not played.truncated
     assert played.returns["agents"].tolist() == [2.0 * t for t in range(8)]
-    frames = rendering.frames(Countdown(), played.states, played.captions(), size=200)
-    assert len(frames) == 8 and all(frame.size == frames[0].size for frame in frames)
-    red = [np.sum(np.asarray(frame)[30, :, 1] == 0) for frame in frames]
-    width = frames[0].width
+    drawn = frames.frames(Countdown(), played.states, played.captions(), size=200)
+    assert len(drawn) == 8 and all(frame.size == drawn[0].size for frame in drawn)
+    red = [np.sum(np.asarray(frame)[30, :, 1] == 0) for frame in drawn]
+    width = drawn[0].width
     assert red == [(7 - t) * width // 7 for t in range(8)]
 
 
@@ -200,7 +202,7 @@ def test_a_joined_team_looks_like_the_task_it_joins():
     env = make("simple_tag")
     joined = JointTeam(env, "adversaries")
     states = jax.tree.map(lambda leaf: leaf[None], joined.reset(jax.random.key(0))[0])
-    (one,), (other,) = rendering.frames(env, states, size=150), rendering.frames(joined, states, size=150)
+    (one,), (other,) = frames.frames(env, states, size=150), frames.frames(joined, states, size=150)
     np.testing.assert_array_equal(np.asarray(one), np.asarray(other))
 
 
@@ -215,7 +217,7 @@ def test_a_joined_team_looks_like_the_task_it_joins():
 def test_what_cannot_be_drawn_is_said_in_one_line(draw, wanted, monkeypatch):
     monkeypatch.setattr(Countdown, "draw", draw)
     with pytest.raises(UserError, match=wanted):
-        rendering.frames(Countdown(), jnp.arange(2))
+        frames.frames(Countdown(), jnp.arange(2))
 
 
 # ---- files -----------------------------------------------------------------------------------------------------------
@@ -236,7 +238,7 @@ def test_colours_survive_in_a_gif(tmp_path):
     frames = striped(9)
     ramp = np.full((31, 45, 3), 255, np.uint8)
     ramp[:20] = np.linspace(0, 255, 20 * 45).reshape(20, 45, 1)
-    animation.write(tmp_path / "a.gif", [*frames, Image.fromarray(ramp)], fps=20)
+    encode.write(tmp_path / "a.gif", [*frames, Image.fromarray(ramp)], fps=20)
     read = frames_of(tmp_path / "a.gif")
     assert len(read) == 10
     for k, pixels in enumerate(read[:9]):
@@ -261,13 +263,13 @@ def fake_ffmpeg(tmp_path, monkeypatch):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a script stands in for ffmpeg")
 def test_mp4_goes_through_ffmpeg_frame_by_frame(fake_ffmpeg):
-    animation.write(fake_ffmpeg / "a.mp4", striped(5), fps=12)
+    encode.write(fake_ffmpeg / "a.mp4", striped(5), fps=12)
     pixels = np.frombuffer((fake_ffmpeg / "input").read_bytes(), np.uint8).reshape(5, 31, 45, 3)
     np.testing.assert_array_equal(pixels, [np.asarray(frame) for frame in striped(5)])
     arguments = (fake_ffmpeg / "arguments").read_text()
     assert "-s 45x31" in arguments and "-r 12" in arguments and arguments.endswith(str(fake_ffmpeg / "a.mp4"))
     with pytest.raises(UserError, match="Unknown encoder"):
-        animation.write(fake_ffmpeg / "broken.mp4", striped(1), fps=12)
+        encode.write(fake_ffmpeg / "broken.mp4", striped(1), fps=12)
 
 
 def test_without_ffmpeg_one_line_says_what_to_do(run, monkeypatch, tmp_path):
@@ -278,5 +280,5 @@ def test_without_ffmpeg_one_line_says_what_to_do(run, monkeypatch, tmp_path):
 
 @pytest.mark.skipif(importlib.import_module("shutil").which("ffmpeg") is None, reason="no ffmpeg on the PATH")
 def test_a_real_mp4(tmp_path):
-    animation.write(tmp_path / "a.mp4", striped(5), fps=12)
+    encode.write(tmp_path / "a.mp4", striped(5), fps=12)
     assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"

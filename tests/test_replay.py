@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from matd3_jax import replay
+from matd3_jax.core import replay
 
 SEEDS, CAPACITY, N, WIDTH = 3, 12, 4, 5
 

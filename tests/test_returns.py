@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from ledger import HYPER, Ledger, by_hand
 
-from matd3_jax import learner, replay, returns
-from matd3_jax.algorithms import Algorithm
-from matd3_jax.schedule import Schedule
-from matd3_jax.spec import Spec
-from matd3_jax.trainer import Trainer
+from matd3_jax.core import n_step, replay, update
+from matd3_jax.core.agents import Spec
+from matd3_jax.core.algorithm import Algorithm
+from matd3_jax.training.loop import Trainer
+from matd3_jax.training.schedule import Schedule
 
 GAMMAS = (0.7, 0.0)
 """Of the two agents; with 0 the sum is the first reward, and nothing but a one-step return has a future."""
@@ -97,7 +97,7 @@ def test_returns_by_python(n, collects):
     @jax.jit
     def drawn(seed, indices):
         written = replay.Written(CAPACITY, SCHEDULE.collect_steps, state.collects)
-        return returns.draw(spec(n), state.replay, seed, indices, written, ENVS, jnp.array(GAMMAS))
+        return n_step.draw(spec(n), state.replay, seed, indices, written, ENVS, jnp.array(GAMMAS))
 
     oldest = max(0, steps - CAPACITY // ENVS)
     lengths, ends = set(), set()
@@ -121,11 +121,11 @@ def test_returns_by_python(n, collects):
 def test_updates_get_them(monkeypatch):
     """What the loop's updates are given: returns discounted by each agent's own gamma, from all of the replay."""
 
-    def update(spec, state, hyper, rows, *args, **kwargs):
+    def stub(spec, state, hyper, rows, *args, **kwargs):
         parts = spec.row_parts(rows)
-        return state, learner.UpdateMetrics(parts.reward.mean(axis=(0, 1)), *2 * [jnp.full(2, parts.more.mean())])
+        return state, update.UpdateMetrics(parts.reward.mean(axis=(0, 1)), *2 * [jnp.full(2, parts.more.mean())])
 
-    monkeypatch.setattr(learner, "update", update)
+    monkeypatch.setattr(update, "update", stub)
     trainer, state, played = play(5)
     trainer.schedule = dataclasses.replace(SCHEDULE, batch_size=20_000)
     state, metrics = trainer.chunk(1)(jax.tree.map(jnp.copy, state))

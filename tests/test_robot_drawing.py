@@ -8,10 +8,11 @@ import types
 import numpy as np
 import pytest
 
-from matd3_jax import config, opengl, rendering, robot_drawing
+from matd3_jax import config
 from matd3_jax.envs import make
 from matd3_jax.envs.colours import BLUE, VERMILION
 from matd3_jax.errors import UserError
+from matd3_jax.video import frames, mujoco_renderer, opengl
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -57,7 +58,7 @@ def gl():
 
 def draw(env, qpos) -> list[np.ndarray]:
     """Pictures of 300 x 200 pixels."""
-    drawing = robot_drawing.RobotDrawing(env)
+    drawing = mujoco_renderer.RobotDrawing(env)
     return [np.asarray(image, int) for image in drawing.images(np.asarray(qpos, np.float64), 300, 200)]
 
 
@@ -86,7 +87,7 @@ def test_each_agent_has_its_colour_and_the_torso_none(gl):
 def test_the_floor_is_a_quiet_checkerboard_under_a_white_sky(gl):
     (image,) = draw(robot(**PLANAR), [np.zeros(5)])
     assert image[2, 150].min() > 250
-    dark, bright = robot_drawing.FLOOR
+    dark, bright = mujoco_renderer.FLOOR
     for colour in (dark, bright):
         assert np.sum(np.abs(image[120:] - colour).max(axis=-1) < 20) > 1000
 
@@ -114,7 +115,7 @@ def test_a_robot_that_blew_up_stays_as_it_was(gl):
 
 def test_pictures_come_with_caption_and_legend(gl):
     env = robot(**FREE)
-    (frame,) = rendering.frames(env, env.mj_model.qpos0[None], ["step 3   return 1.5"], size=320)
+    (frame,) = frames.frames(env, env.mj_model.qpos0[None], ["step 3   return 1.5"], size=320)
     pixels = np.asarray(frame, int)
     assert frame.size == (320, 240)
     assert (pixels[:18].max(axis=-1) < 60).sum() > 40
@@ -125,7 +126,7 @@ def test_pictures_come_with_caption_and_legend(gl):
 def test_drawing_works_whoever_imported_mujoco_first(gl):
     """MuJoCo chooses its OpenGL when it is imported, before anybody asked us."""
     program = (
-        "import mujoco\nfrom matd3_jax import opengl\ncontext = opengl.context_class()(8, 8)\n"
+        "import mujoco\nfrom matd3_jax.video import opengl\ncontext = opengl.context_class()(8, 8)\n"
         "context.make_current()\nmodel = mujoco.MjModel.from_xml_string('<mujoco/>')\n"
         "print(mujoco.MjrContext(model, 100).offWidth)\ncontext.free()"
     )
@@ -165,7 +166,7 @@ def test_real_robots_show_every_agent(gl, name):
     env = make(name)
     (image,) = draw(env, [env.mj_model.qpos0])
     for agent in range(len(env.agents)):
-        assert hue(image, robot_drawing.agent_colour(agent)).sum() > 100, agent
+        assert hue(image, mujoco_renderer.agent_colour(agent)).sum() > 100, agent
 
 
 def test_an_opengl_that_mujoco_does_not_know_is_one_line_of_the_command(tmp_path):

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 import matd3_jax
-from matd3_jax import checkpoint, config
-from matd3_jax.training import Training
+from matd3_jax import config
+from matd3_jax.training import checkpoint
+from matd3_jax.training.session import Training
 
 pytestmark = pytest.mark.usefixtures("quick_jit")
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from matd3_jax import search_space
 from matd3_jax.errors import UserError
-from matd3_jax.search_space import SearchSpace
+from matd3_jax.sweep import search_space
+from matd3_jax.sweep.search_space import SearchSpace
 
 
 def test_grid_is_every_combination_last_key_fastest():

@@ -9,7 +9,7 @@ import reference
 from learner_cases import layers
 
 import matd3_jax
-from matd3_jax import episode
+from matd3_jax.evaluation import trajectory
 
 SMALL = {
     "seeds": 1, "num_envs": 2, "rollout_length": 5, "batch_size": 8, "learning_starts": 20, "total_steps": 60,
@@ -74,7 +74,7 @@ def test_deterministic_words(name):
     """Without noise the word is the softmax of its own logits, or the likeliest one, whatever the movement's are."""
     result, (env, actions, _) = trained(name), RUNS[name]
     training = result.training
-    states = episode.play(training, result.state, max_steps=3).states
+    states = trajectory.play(training, result.state, max_steps=3).states
     seen = jax.vmap(training.env.observe)(states)
     for speaker in HEARD[env]:
         g, k = training.spec.place(speaker)

@@ -22,9 +22,9 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from matd3_jax import bootstrap
-from matd3_jax.bootstrap import aggregate, average, performance_profile, probability_of_improvement
-from matd3_jax.statistics import compare, mean_interval, t_interval, welch_interval
+from matd3_jax.stats import bootstrap
+from matd3_jax.stats.bootstrap import aggregate, average, performance_profile, probability_of_improvement
+from matd3_jax.stats.intervals import compare, mean_interval, t_interval, welch_interval
 
 RLIABLE = json.loads((Path(__file__).parent / "data" / "rliable.json").read_text())
 X, Y = np.array(RLIABLE["x"]), np.array(RLIABLE["y"])

@@ -10,9 +10,10 @@ from study_cases import NOISE, fake_run, verdicts
 
 from experiments import all as everything
 from experiments import ant, collecting, competitive, cooperative, grid_search, study, target_smoothing, tidy
-from matd3_jax import config, sweeping
+from matd3_jax import config
 from matd3_jax.errors import UserError
-from matd3_jax.runs import RunDirectory
+from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.sweep import runner
 
 
 def test_competitive_from_run_directories(tmp_path):
@@ -60,7 +61,7 @@ def test_competitive_from_run_directories(tmp_path):
 def trained(monkeypatch):
     """Nothing is trained: what would have been is remembered."""
     asked = []
-    monkeypatch.setattr(sweeping, "train", lambda settings, folder: asked.append(dict(settings)) or {})
+    monkeypatch.setattr(runner, "train", lambda settings, folder: asked.append(dict(settings)) or {})
     return asked
 
 

@@ -2,7 +2,6 @@
 
 import csv
 import dataclasses
-import importlib
 import json
 import shutil
 import signal
@@ -11,13 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from matd3_jax import checkpoint, config, jobs, ranking, sweep, sweeping
+from matd3_jax import config
+from matd3_jax.cli import sweep, train
 from matd3_jax.errors import UserError
-from matd3_jax.runs import RunDirectory
-from matd3_jax.sweeping import Piece, Sweep
-from matd3_jax.training import Training
-
-train = importlib.import_module("matd3_jax.train")
+from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.sweep import launcher, ranking, runner
+from matd3_jax.sweep.runner import Piece, Sweep
+from matd3_jax.training import checkpoint
+from matd3_jax.training.session import Training
 
 # Small enough to run in a second or two; both teams, an evaluation and the delay are there.
 TINY = [
@@ -79,7 +79,7 @@ def test_members_learn_with_their_own_numbers(swept):
 
 
 def test_a_member_can_be_evaluated_but_not_gone_on_with(swept):
-    from matd3_jax import evaluate
+    from matd3_jax.cli import evaluate
 
     assert evaluate.main([f"run={swept / 'runs' / 'lr_0.1-tau_0.01'}", "episodes=2"]) == 0
     with pytest.raises(UserError, match="no replay"):
@@ -165,7 +165,7 @@ def test_stopped_and_gone_on_with_it_is_the_same_sweep(swept, tmp_path, monkeypa
 def test_pieces_are_jobs_of_their_own_and_cut_by_memory(swept, tmp_path, monkeypatch, capsys):
     """With memory for two seeds: two pieces, trained apart, the same table in the end. What one process works at,
     another leaves alone."""
-    monkeypatch.setattr(sweeping, "fitting_seeds", lambda settings, budget: 4)
+    monkeypatch.setattr(runner, "fitting_seeds", lambda settings, budget: 4)
     assert sweep.main([*TINY, *SWEPT, "seeds=2", f"out={tmp_path}", "name=apart", "train=false"]) == 0
     folder = tmp_path / "apart"
     assert [len(piece) for piece in Sweep(folder).pieces] == [2, 2]
@@ -193,16 +193,16 @@ def test_more_seeds_train_only_what_is_missing(swept, tmp_path, monkeypatch):
     monkeypatch.setattr(Piece, "train", lambda self, stop: trained.append([(m.seed, m.seeds) for m in self.members]))
     settings = {"lr_0.1-tau_0.01": config.load([*TINY, "algo.lr=0.1", "algo.tau=0.01", "seeds=3"])}
     with pytest.raises(UserError, match="not finished"):
-        sweeping.train(settings, copy)
+        runner.train(settings, copy)
     assert trained == [[(2, 1)]]
     settings = {name: dataclasses.replace(c, seeds=2) for name, c in settings.items()}
-    assert sweeping.train(settings, copy) == {"lr_0.1-tau_0.01": [copy / "runs" / "lr_0.1-tau_0.01"]}
+    assert runner.train(settings, copy) == {"lr_0.1-tau_0.01": [copy / "runs" / "lr_0.1-tau_0.01"]}
     assert len(trained) == 1
 
 
 def test_a_launcher_trains_nothing_that_is_finished(swept, capfd):
     """Hydra starts the jobs, in folders of the sweep's own."""
-    assert jobs.launch(swept, 1, "basic", []) == 0
+    assert launcher.launch(swept, 1, "basic", []) == 0
     assert (swept / "jobs" / "0" / ".hydra" / "overrides.yaml").exists()
 
 

@@ -1,7 +1,6 @@
 """The commands: what a run leaves, resuming to the bit, signals, damage, bad input that writes nothing."""
 
 import csv
-import importlib
 import json
 import os
 import re
@@ -15,10 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from matd3_jax import checkpoint, command, evaluate
+from matd3_jax.cli import command, evaluate, train
 from matd3_jax.errors import UserError
-
-train = importlib.import_module("matd3_jax.train")  # the name in the package is the function
+from matd3_jax.training import checkpoint
 
 # A schedule and networks so small that a run takes a second; every part of the real one is there, two teams included.
 TINY = [

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from ledger import ENDS, HYPER, LIMIT, Ledger, by_hand
 
-from matd3_jax import learner, rollout
-from matd3_jax.algorithms import Algorithm
-from matd3_jax.schedule import Schedule
-from matd3_jax.spec import Spec
-from matd3_jax.trainer import Trainer
+from matd3_jax.core import rollout, update
+from matd3_jax.core.agents import Spec
+from matd3_jax.core.algorithm import Algorithm
+from matd3_jax.training.loop import Trainer
+from matd3_jax.training.schedule import Schedule
 
 MATD3 = Algorithm(hidden=(4,))
 MADDPG = Algorithm(name="maddpg", hidden=(4,), num_critics=1, policy_delay=1)
@@ -166,10 +166,10 @@ def test_counts_of_the_real_learner():
 
 
 def stub(log):
-    """In `learner.update`'s place: writes into the actors a binary number of the moves so far (first bit a 1), and the
+    """In `update.update`'s place: writes into the actors a binary number of the moves so far (first bit a 1), and the
     number of different transitions and of empty rows in the minibatches into the metrics."""
 
-    def update(spec, state, hyper, rows, key, move, *args, **kwargs):
+    def replaced(spec, state, hyper, rows, key, move, *args, **kwargs):
         log.append(rows.shape)
         state = tuple(
             s._replace(actor=jax.tree.map(lambda leaf, m=m: 2 * leaf + m, s.actor))
@@ -178,15 +178,15 @@ def stub(log):
         name = jnp.sort((rows[..., 0] + rows[..., 1]).ravel())  # number of the episode + step
         different, empty = 1.0 + (jnp.diff(name) > 0).sum(), (rows[..., 0] == 0).sum()
         own = jnp.mean(rows[0] != rows[-1])
-        return state, learner.UpdateMetrics(*(jnp.full(spec.num_agents, v) for v in (different, empty, own)))
+        return state, update.UpdateMetrics(*(jnp.full(spec.num_agents, v) for v in (different, empty, own)))
 
-    return update
+    return replaced
 
 
 def stubbed_run(monkeypatch, trainer, state, cycles):
     """(moves of each group so far as a string of bits, metrics of each cycle, shapes of the rows)."""
     log = []
-    monkeypatch.setattr(learner, "update", stub(log))
+    monkeypatch.setattr(update, "update", stub(log))
     ones = jax.tree.map(lambda leaf: jnp.ones_like(leaf), [g.actor for g in state.groups])
     state = state._replace(groups=tuple(g._replace(actor=a) for g, a in zip(state.groups, ones, strict=True)))
     state, metrics = trainer.chunk(cycles)(state)

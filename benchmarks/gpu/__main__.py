@@ -26,8 +26,10 @@ from pathlib import Path
 from benchmarks.gpu import ant, ant_wide, checks, figure, floor, launches, seeds, targets, variants, wall_clock
 from benchmarks.gpu.report import Report
 from benchmarks.gpu.stretch import Length
-from matd3_jax import command, config, devices
+from matd3_jax import config
+from matd3_jax.cli import command
 from matd3_jax.errors import UserError
+from matd3_jax.runtime import devices
 
 PARTS: dict[str, Callable[[Report, float, Length], None]] = {
     "check": lambda report, scale, length: checks.run(report),

@@ -10,7 +10,7 @@ from benchmarks.gpu.stretch import Length
 from experiments import evaluations, figures, tidy
 from experiments.tidy import Table
 from matd3_jax import config
-from matd3_jax.training import Training
+from matd3_jax.training.session import Training
 
 SEEDS, STEPS = 6, 1_000_000
 COLUMNS = ("seed", "step", "updates", *evaluations.COLUMNS)

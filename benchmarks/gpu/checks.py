@@ -8,8 +8,9 @@ import numpy as np
 
 from benchmarks.gpu.report import Report, Row
 from benchmarks.loop import copies_in
-from matd3_jax import config, envs, learner
-from matd3_jax.training import Training
+from matd3_jax import config, envs
+from matd3_jax.core import update
+from matd3_jax.training.session import Training
 
 RECORDED = Path(__file__).parents[2] / "tests" / "data" / "ant"
 
@@ -27,9 +28,9 @@ def run(report: Report) -> None:
     if products is not None and not products["float32"] < PRODUCT:
         report.wrong.append(f"products in float32 are off by {products['float32']:.2g}")
     for name in ("float32", "default"):
-        update = report.case("check", f"update, {name}", lambda name=name: update_error(PRECISIONS[name]))
-        if name == "float32" and update is not None and not update["error"] < UPDATE:
-            report.wrong.append(f"an update in float32 differs from the CPU's by {update['error']:.2g} of its length")
+        found = report.case("check", f"update, {name}", lambda name=name: update_error(PRECISIONS[name]))
+        if name == "float32" and found is not None and not found["error"] < UPDATE:
+            report.wrong.append(f"an update in float32 differs from the CPU's by {found['error']:.2g} of its length")
     copies = report.case("check", "replay", lambda: {"copies": replay_copies()})
     if copies is not None and copies["copies"]:
         report.wrong.append(f"the loop copies the replay {copies['copies']} times")
@@ -57,11 +58,11 @@ def update_error(precision: str | None) -> Row:
     before, after = [], []
     for device, kind in ((jax.devices()[0], precision), (jax.devices("cpu")[0], "highest")):
         with jax.default_device(device), jax.default_matmul_precision(kind):
-            state = learner.init(spec, jax.random.key(0))
+            state = update.init(spec, jax.random.key(0))
             rows = jax.random.normal(jax.random.key(1), (spec.num_agents, 1024, spec.row_size)) * 0.3
-            update = jax.jit(lambda s, r: learner.update(spec, s, hyper, r, jax.random.key(2), [True])[0])
+            program = jax.jit(lambda s, r: update.update(spec, s, hyper, r, jax.random.key(2), [True])[0])
             before.append(_flat(state[0].critic))
-            after.append(_flat(update(state, rows)[0].critic))
+            after.append(_flat(program(state, rows)[0].critic))
     length = np.linalg.norm(after[1] - before[1])
     ours = after[0] - before[0] - (after[1] - before[1])
     return {"error": float(np.linalg.norm(ours) / length), "start": float(np.abs(before[0] - before[1]).max())}

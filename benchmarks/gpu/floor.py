@@ -4,7 +4,7 @@ from benchmarks import limits
 from benchmarks.gpu import seeds
 from benchmarks.gpu.report import Report, Row
 from matd3_jax import config
-from matd3_jax.training import Training
+from matd3_jax.training.session import Training
 
 
 def run(report: Report, scale: float) -> None:

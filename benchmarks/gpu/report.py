@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.commit import commit
-from matd3_jax import devices
 from matd3_jax.errors import UserError
+from matd3_jax.runtime import devices
 
 Row = dict[str, Any]
 

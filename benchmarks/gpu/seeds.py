@@ -3,9 +3,11 @@
 from benchmarks.gpu import stretch
 from benchmarks.gpu.report import Report, Row
 from benchmarks.gpu.stretch import Length
-from matd3_jax import config, devices, memory
-from matd3_jax.trainer import Trainer
-from matd3_jax.training import Training
+from matd3_jax import config
+from matd3_jax.runtime import devices
+from matd3_jax.training import memory
+from matd3_jax.training.loop import Trainer
+from matd3_jax.training.session import Training
 
 REPLAY = 1_000_000
 """The paper's."""

@@ -11,8 +11,8 @@ import numpy as np
 from benchmarks import throughput
 from benchmarks.gpu.report import Row
 from matd3_jax import config
-from matd3_jax.trainer import Trainer, TrainState
-from matd3_jax.training import Training
+from matd3_jax.training.loop import Trainer, TrainState
+from matd3_jax.training.session import Training
 
 
 class Length(NamedTuple):

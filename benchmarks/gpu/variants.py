@@ -13,7 +13,7 @@ from benchmarks.gpu.checks import PRECISIONS
 from benchmarks.gpu.report import Report, Row
 from benchmarks.gpu.stretch import Length
 from matd3_jax import config
-from matd3_jax.training import Training
+from matd3_jax.training.session import Training
 
 COMMANDS = "FUSION,CUBLAS,CUBLASLT,CUSTOM_CALL,CUDNN,DYNAMIC_SLICE_FUSION"
 """What XLA puts into command buffers (CUDA graphs) by default, where at least five of them follow each other."""

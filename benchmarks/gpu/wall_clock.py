@@ -10,8 +10,9 @@ from benchmarks.gpu.checks import PRECISIONS
 from benchmarks.gpu.report import Report, Row
 from experiments import figures, tidy
 from experiments.tidy import Table
-from matd3_jax import config, statistics
-from matd3_jax.training import Training
+from matd3_jax import config
+from matd3_jax.stats import intervals
+from matd3_jax.training.session import Training
 
 RECORDED = Path(__file__).parents[2] / "experiments" / "results" / "cooperative" / "data.csv"
 """Ten seeds of the same, trained on a CPU."""
@@ -78,7 +79,7 @@ def beside(ours: Table, theirs: Table) -> list[Row]:
     for point in [p for p in POINTS if p <= end] or [int(end)]:
         a = np.array([np.interp(point, episodes, curve) for curve in values])
         b = np.array([np.interp(point, their_episodes, curve) for curve in their_values])
-        test = statistics.compare(a, b)
+        test = intervals.compare(a, b)
         row = {"ours": a.mean(), "cpu": b.mean(), "difference": test.difference, "low": test.low, "high": test.high}
         found.append({"episodes": point, **{key: float(value) for key, value in row.items()}, "p": float(test.p)})
     return found

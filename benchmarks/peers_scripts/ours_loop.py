@@ -6,8 +6,9 @@ Case: {"settings": overrides of the run, "steps": env steps of each seed in a st
 import jax
 import serve
 
-from matd3_jax import config, devices
-from matd3_jax.training import Training
+from matd3_jax import config
+from matd3_jax.runtime import devices
+from matd3_jax.training.session import Training
 
 COMMON = ("eval_every=0", "total_steps=1000000")
 

@@ -49,8 +49,9 @@ def make(case: dict):
         import jaxmarl
 
         return jaxmarl.make(case["env"], **case["options"])
-    from matd3_jax import devices, envs
+    from matd3_jax import envs
     from matd3_jax.envs.jaxmarl import JaxMARL
+    from matd3_jax.runtime import devices
 
     devices.prepare()  # with the settings of XLA that our commands run with
     return JaxMARL(envs.make(case["env"], **case["options"]))

@@ -1,0 +1,256 @@
+"""`python -m matd3_jax.crossplay runs=A,B,C`: every run's agents against every run's adversaries."""
+
+import csv
+import dataclasses
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from matd3_jax import config, envs
+from matd3_jax.config import Config
+from matd3_jax.envs.base import Environment, nearest
+from matd3_jax.errors import UserError
+from matd3_jax.evaluation import cross_play
+from matd3_jax.evaluation.cross_play import TEAMS, Team
+from matd3_jax.evaluation.cross_play_table import Mean, Pairings, pairs_of
+from matd3_jax.figures import heat_map
+from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.runs.paths import paths
+from matd3_jax.runtime import devices
+from matd3_jax.training import checkpoint
+from matd3_jax.training.session import Training
+
+HELP = """usage: python -m matd3_jax.crossplay runs=A,B,C [key=value ...]
+
+Plays the agents of every run against the adversaries of every run, all in the same environment and from the same start
+states, and prints the matrix of mean returns with 95 % intervals over seeds. Pairs that were trained together (same
+run, same seed: "own") stand apart from all others.
+
+  runs=A,B,C               run directories, with commas or wildcards (runs=runs/push-*); one alone meets itself
+  pairing=all              every seed with every seed; matched: the first seed of one run with the first of the other...
+  episodes=100             whole episodes of each pair of seeds
+  deterministic=false      sampled, as in training; true: no noise at all
+  seed=0                   of the start states, as in `evaluate`
+  checkpoint=STEP          of all runs; default: the last of each
+  out=crossplay/ENV-TIME   where to: a directory that is not there yet, or empty"""
+
+DEFAULTS: dict[str, Any] = {
+    "pairing": "all",
+    "episodes": 100,
+    "deterministic": False,
+    "seed": 0,
+    "checkpoint": None,
+    "out": None,
+}
+PAIRINGS = ("all", "matched")
+
+
+class Entrant(NamedTuple):
+    """A run with what it sends."""
+
+    name: str
+    path: Path
+    settings: Config
+    step: int
+    """Env step of the checkpoint."""
+    teams: dict[str, Team]
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command; the exit code."""
+    if {"-h", "--help"} & set(argv):
+        print(HELP)
+        return 0
+    devices.prepare()
+    where, options = _options(argv)
+    matched = options["pairing"] == "matched"
+    entrants, env = _entrants(where, options["checkpoint"], matched)
+    out = _directory(options["out"], entrants[0].settings)
+    pairings = _play(entrants, env, options, matched)
+    kind = "deterministic" if options["deterministic"] else "sampled"
+    who = "seed with seed" if matched else "seeds x seeds"
+    title = f"{entrants[0].settings.env['name']}, {who}, {options['episodes']} {kind} episodes of each pair"
+    _print(pairings, [entrant.name for entrant in entrants], title)
+    _write(out, pairings, entrants, options)
+    heat_map.draw(out / "heat_map.png", [entrant.name for entrant in entrants], pairings, title)
+    print(
+        f"every pair: {out / 'pairs.csv'}\nmeans and intervals: {out / 'means.csv'}\nheat map: {out / 'heat_map.png'}"
+    )
+    return 0
+
+
+# ---- who plays -------------------------------------------------------------------------------------------------------
+
+
+def _entrants(where: Sequence[Path], step: int | None, matched: bool) -> tuple[list[Entrant], Environment]:
+    """The runs, and the environment that all have in common."""
+    opened = [RunDirectory.open(path) for path in where]
+    for k, path in enumerate(where):
+        if any(path.resolve() == other.resolve() for other in where[:k]):
+            raise UserError(f"runs: {path} is there twice")
+    _, first = opened[0]
+    env = envs.make(**first.env)
+    for run, settings in opened[1:]:
+        _check_same(env, first, where[0], envs.make(**settings.env), settings, run.path)
+        if matched and settings.seeds != first.seeds:
+            raise UserError(
+                f"pairing=matched needs equally many seeds: {where[0]} has {first.seeds}, {run.path} {settings.seeds}"
+            )
+    if set(env.teams) != set(TEAMS):
+        raise UserError(f"{first.env['name']} has no adversaries: there is nobody to play against")
+    found = [checkpoint.verify(run.checkpoints, step) for run, _ in opened]
+    names = [path.resolve().name for path in where]
+    if len(set(names)) < len(names):
+        names = [str(path) for path in where]
+    entrants = []
+    for name, (run, settings), saved in zip(names, opened, found, strict=True):
+        training = Training(settings)
+        state = checkpoint.restore_actors(saved, training.trainer)
+        teams = {team: cross_play.team_of(training, env, state, team) for team in TEAMS}
+        entrants.append(Entrant(name, run.path, settings, int(saved.name), teams))
+    return entrants, env
+
+
+def _check_same(env: Environment, first: Config, a: Path, other: Environment, settings: Config, b: Path) -> None:
+    """Raise UserError, naming the first key that differs, unless both runs were trained in the same environment."""
+    if env == other:
+        return
+    names = ["name"] if type(env) is not type(other) else [field.name for field in dataclasses.fields(env)]  # type: ignore[arg-type]
+    for name in names:
+        one, two = (
+            (s.env.get("name") if name == "name" else getattr(e, name)) for s, e in ((first, env), (settings, other))
+        )
+        if one != two:
+            raise UserError(f"runs of different environments cannot meet: env.{name}={one} in {a}, {two} in {b}")
+
+
+def _directory(out: str | None, settings: Config) -> Path:
+    """Where the results go, made now. Raises UserError where something is there already."""
+    path = Path(out or f"crossplay/{settings.env['name']}-{time.strftime('%Y%m%d-%H%M%S')}")
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        taken = any(path.iterdir())
+    except OSError as error:
+        raise UserError(f"out={path}: cannot make this directory: {error.strerror}") from error
+    if taken:
+        raise UserError(f"out={path}: something is there already; choose another directory")
+    return path
+
+
+# ---- playing ---------------------------------------------------------------------------------------------------------
+
+
+def _play(entrants: Sequence[Entrant], env: Environment, options: dict[str, Any], matched: bool) -> Pairings:
+    """Everybody against everybody."""
+    weights = np.array([np.where(np.array(env.teams) == team, env.return_weights, 0.0) for team in TEAMS])
+    cells = [(i, j) for i in range(len(entrants)) for j in range(len(entrants))]
+    runs, seeds, returns = [], [], []
+    console = Console(stderr=True)
+    for i, j in track(cells, "playing", console=console, transient=True, disable=not console.is_terminal):
+        pairs = pairs_of(entrants[i].settings.seeds, entrants[j].settings.seeds, matched)
+        teams = [entrants[i].teams["agents"], entrants[j].teams["adversaries"]]
+        played = cross_play.play(env, teams, pairs, options["episodes"], options["deterministic"], options["seed"])
+        runs.append(np.broadcast_to((i, j), pairs.shape))
+        seeds.append(pairs)
+        returns.append(played @ weights.T)
+    return Pairings(np.concatenate(runs), np.concatenate(seeds), np.concatenate(returns), matched)
+
+
+# ---- telling ---------------------------------------------------------------------------------------------------------
+
+
+def _print(pairings: Pairings, names: Sequence[str], title: str) -> None:
+    """A table for each team's return, and the means over all runs."""
+    print(title)
+    console = Console(width=None if Console().is_terminal else 80 + sum(len(name) + 20 for name in names))
+    for t, team in enumerate(TEAMS):
+        table = Table(title=f"return of {team}")
+        table.add_column("agents of")
+        for name in names:
+            table.add_column(f"against {name}", justify="right")
+        for heading in ("own pairs", "cross pairs"):
+            table.add_column(heading, justify="right")
+        for i, name in enumerate(names):
+            cells = []
+            for j in range(len(names)):
+                cross = pairings.cell(i, j, own=False)
+                cells.append(_words(cross, t) if cross else f"own {_words(pairings.cell(i, j, own=True), t)}")
+            table.add_row(name, *cells, *(_words(pairings.summary(i, None, own), t) for own in (True, False)))
+        table.add_section()
+        for own in (True, False):
+            cells = [_words(pairings.summary(None, j, own), t) for j in range(len(names))]
+            total = [_words(pairings.summary(None, None, own), t) if own == column else "" for column in (True, False)]
+            table.add_row("own pairs" if own else "cross pairs", *cells, *total)
+        console.print(table)
+    print("own: trained together (same run, same seed); cross: all others; ± 95 % interval over seeds")
+
+
+def _words(mean: Mean | None, team: int) -> str:
+    return "" if mean is None else heat_map.text(mean.value[team], mean.half[team])
+
+
+def _write(out: Path, pairings: Pairings, entrants: Sequence[Entrant], options: dict[str, Any]) -> None:
+    names = [entrant.name for entrant in entrants]
+    with (out / "pairs.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        heading = ("agents", "agents_seed", "adversaries", "adversaries_seed", "pair")
+        writer.writerow((*heading, *(f"return_{team}" for team in TEAMS), "episodes"))
+        for runs, seeds, returns, own in zip(
+            pairings.runs, pairings.seeds, pairings.returns, pairings.own, strict=True
+        ):
+            who = [x for run, k in zip(runs, seeds, strict=True) for x in (names[run], entrants[run].settings.seed + k)]
+            writer.writerow((*who, _kind(own), *(f"{value:.9g}" for value in returns), options["episodes"]))
+    with (out / "means.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        columns = [name for team in TEAMS for name in (f"return_{team}", f"return_{team}_half_width")]
+        writer.writerow(("agents", "adversaries", "pair", "pairs", *columns))
+        for row in pairings.table():
+            who = ["all" if run is None else names[run] for run in (row.agents, row.adversaries)]
+            values = [f"{x:.9g}" for pair in zip(row.mean.value, row.mean.half, strict=True) for x in pair]
+            writer.writerow((*who, _kind(row.own), row.mean.pairs, *values))
+    runs = {
+        e.name: {
+            "path": str(e.path),
+            "checkpoint": e.step,
+            "algorithms": {team: algo.name for team, algo in e.settings.teams().items()},
+            "seeds": [e.settings.seed + k for k in range(e.settings.seeds)],
+        }
+        for e in entrants
+    }
+    settings = {**{key: options[key] for key in ("pairing", "episodes", "deterministic", "seed")}, "runs": runs}
+    (out / "crossplay.json").write_text(
+        json.dumps({"env": dict(entrants[0].settings.env), **settings, **devices.versions()}, indent=1) + "\n"
+    )
+
+
+def _kind(own: bool) -> str:
+    return "own" if own else "cross"
+
+
+def _options(argv: Sequence[str]) -> tuple[list[Path], dict[str, Any]]:
+    where, rest = paths(argv)
+    taken, rest = config.take(rest, tuple(DEFAULTS))
+    if rest:
+        key = rest[0].split("=")[0]
+        raise UserError(f"there is no key {key!r}; {nearest(key, ['runs', *DEFAULTS])}")
+    if not where:
+        raise UserError("say which runs are to meet: runs=A,B,C")
+    options = {**DEFAULTS, **taken}
+    if options["pairing"] not in PAIRINGS:
+        raise UserError(f"pairing={options['pairing']!r}: must be one of {', '.join(PAIRINGS)}")
+    for key, least, most in (("episodes", 1, 10**6), ("seed", 0, 2**31 - 1)):
+        if type(options[key]) is not int or not least <= options[key] <= most:
+            raise UserError(f"{key}={options[key]!r}: must be a whole number from {least} to {most}")
+    if type(options["deterministic"]) is not bool:
+        raise UserError(f"deterministic={options['deterministic']!r}: must be true or false")
+    if options["checkpoint"] is not None and type(options["checkpoint"]) is not int:
+        raise UserError(f"checkpoint={options['checkpoint']!r}: must be the env step of a checkpoint")
+    options["out"] = None if options["out"] is None else str(options["out"])
+    return where, options

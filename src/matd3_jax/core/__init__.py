@@ -1,0 +1,1 @@
+"""Learning itself: algorithms, networks, losses, updates, replay and rollouts, in pure JAX."""

@@ -1,0 +1,175 @@
+"""Agents, teams and groups, and where each agent's part stands in the joint vectors and the replay rows."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from matd3_jax.core.algorithm import Algorithm
+from matd3_jax.envs.base import ActionSpace, Environment
+
+
+@dataclasses.dataclass(frozen=True)
+class Group:
+    """Agents with the same observation size, action space and algorithm: one stack of networks."""
+
+    members: tuple[int, ...]
+    observation_size: int
+    action_space: ActionSpace
+    algorithm: Algorithm
+
+
+@dataclasses.dataclass(frozen=True)
+class Spec:
+    """Who learns, and the layout of joint vectors.
+
+    The joint observation x [observation_size] and the joint action [action_size] hold the agents' parts in the order
+    of `agents`. A replay row is `x, actions, rewards, x', discount` with discount = 1 - terminated: [row_size] float32.
+    With n_step > 1 an entry `more` stands between rewards and x': 0 where the episode ended, either way, or 1.
+    """
+
+    agents: tuple[str, ...]
+    teams: tuple[str, ...]
+    observation_sizes: tuple[int, ...]
+    action_spaces: tuple[ActionSpace, ...]
+    algorithms: tuple[Algorithm, ...]
+    """One per agent."""
+    n_step: int = 1
+    """Rewards in a target before it bootstraps (see `returns`)."""
+
+    @classmethod
+    def of(cls, env: Environment, algorithms: Mapping[str, Algorithm], n_step: int = 1) -> "Spec":
+        """The spec of `env` with the algorithm of each team given by name."""
+        return cls(
+            agents=env.agents,
+            teams=env.teams,
+            observation_sizes=env.observation_sizes,
+            action_spaces=env.action_spaces,
+            algorithms=tuple(algorithms[team] for team in env.teams),
+            n_step=n_step,
+        )
+
+    @property
+    def num_agents(self) -> int:
+        return len(self.agents)
+
+    def by_team(self) -> dict[str, list[str]]:
+        """Names of the agents of each team."""
+        return {t: [a for a, team in zip(self.agents, self.teams, strict=True) if team == t] for t in self.teams}
+
+    @property
+    def observation_size(self) -> int:
+        return sum(self.observation_sizes)
+
+    @property
+    def action_size(self) -> int:
+        return sum(space.size for space in self.action_spaces)
+
+    @cached_property
+    def observation_starts(self) -> tuple[int, ...]:
+        """First entry of each agent's part in the joint observation."""
+        return _starts(self.observation_sizes)
+
+    @cached_property
+    def action_starts(self) -> tuple[int, ...]:
+        """First entry of each agent's part in the joint action."""
+        return _starts([space.size for space in self.action_spaces])
+
+    @cached_property
+    def groups(self) -> tuple[Group, ...]:
+        """The groups, in the order of their first members."""
+        members: dict[tuple[int, ActionSpace, Algorithm], list[int]] = {}
+        for i, key in enumerate(zip(self.observation_sizes, self.action_spaces, self.algorithms, strict=True)):
+            members.setdefault(key, []).append(i)
+        return tuple(Group(tuple(who), *key) for key, who in members.items())
+
+    def place(self, agent: int) -> tuple[int, int]:
+        """(group number, place among its members) of an agent."""
+        g = next(g for g, group in enumerate(self.groups) if agent in group.members)
+        return g, self.groups[g].members.index(agent)
+
+    # ---- replay rows -------------------------------------------------------------------------------------------------
+
+    @property
+    def row_size(self) -> int:
+        return 2 * self.observation_size + self.action_size + self.num_agents + 1 + (self.n_step > 1)
+
+    def pack_rows(
+        self,
+        x: chex.Array,
+        action: chex.Array,
+        reward: chex.Array,
+        next_x: chex.Array,
+        terminated: chex.Array,
+        truncated: chex.Array,
+    ) -> chex.Array:
+        """Replay rows [..., row_size] of x, next_x [..., observation_size], action [..., action_size],
+        reward [..., num_agents], terminated and truncated [...]."""
+        more = [1.0 - (terminated | truncated).astype(jnp.float32)[..., None]] if self.n_step > 1 else []
+        discount = 1.0 - terminated.astype(jnp.float32)[..., None]
+        return jnp.concatenate([x, action, reward, *more, next_x, discount], axis=-1, dtype=jnp.float32)
+
+    @property
+    def observation_columns(self) -> tuple[slice, slice]:
+        """Where x and x' stand in a row."""
+        return slice(0, self.observation_size), slice(-1 - self.observation_size, -1)
+
+    def row_parts(self, rows: chex.Array) -> "RowParts":
+        """The parts of rows [..., row_size]."""
+        x, next_x = self.observation_columns
+        joint = self.observation_size + self.action_size
+        end = joint + self.num_agents
+        return RowParts(
+            inputs=rows[..., :joint],
+            x=rows[..., x],
+            action=rows[..., self.observation_size : joint],
+            reward=rows[..., joint:end],
+            more=rows[..., end] if self.n_step > 1 else None,
+            next_x=rows[..., next_x],
+            discount=rows[..., -1],
+        )
+
+    # ---- joint vectors -----------------------------------------------------------------------------------------------
+
+    def observation_part(self, x: chex.Array, agent: int) -> chex.Array:
+        """o_i [..., observation_sizes[agent]] of joint observations x."""
+        start = self.observation_starts[agent]
+        return x[..., start : start + self.observation_sizes[agent]]
+
+    def action_part(self, action: chex.Array, agent: int) -> chex.Array:
+        """a_i [..., action size of the agent] of joint actions."""
+        start = self.action_starts[agent]
+        return action[..., start : start + self.action_spaces[agent].size]
+
+    def join_actions(self, parts: Sequence[chex.Array]) -> chex.Array:
+        """Joint actions [..., action_size] from one array [members, ..., size] per group."""
+        by_agent = {i: part[k] for group, part in zip(self.groups, parts, strict=True) for k, i in _numbered(group)}
+        return jnp.concatenate([by_agent[i] for i in range(self.num_agents)], axis=-1)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class RowParts:
+    """Named parts of replay rows [..., row_size]."""
+
+    inputs: chex.Array
+    """x and actions side by side: what a central critic reads."""
+    x: chex.Array
+    action: chex.Array
+    reward: chex.Array
+    more: chex.Array | None
+    """Whether the episode goes on; in rows that `n_step.draw` gives, how many steps of a return follow the first. None
+    with n_step = 1."""
+    next_x: chex.Array
+    discount: chex.Array
+
+
+def _numbered(group: Group) -> list[tuple[int, int]]:
+    return list(enumerate(group.members))
+
+
+def _starts(sizes: Sequence[int]) -> tuple[int, ...]:
+    return tuple(sum(sizes[:i]) for i in range(len(sizes)))

@@ -1,0 +1,131 @@
+"""Overestimation measured: the critics' estimates beside the true discounted returns (PAPER section 3).
+
+A reservoir keeps states and joint actions collected since the last evaluation, each with the whole state of its
+environment. From there the true value is played out: the stored action, then the policies as they are now. For one
+seed; `vmap` for more.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from matd3_jax.core import networks, rollout, running_statistics, update
+from matd3_jax.core.agents import Spec
+from matd3_jax.core.rollout import Policy
+from matd3_jax.envs.base import Environment
+
+
+class Pairs(NamedTuple):
+    """States and joint actions; leading axis [pairs]."""
+
+    state: Any
+    """Of the environments, before the action."""
+    inputs: chex.Array
+    """[pairs, observation_size + action_size] joint observation and joint action as in the replay."""
+
+
+class Reservoir(NamedTuple):
+    """Each pair is drawn uniformly, on its own, from all that was collected since the last evaluation."""
+
+    pairs: Pairs
+    since: chex.Array
+    """int32 scalar: collects done at the last evaluation."""
+
+
+class Values(NamedTuple):
+    """Of each pair and agent: [pairs, num_agents]."""
+
+    estimate: chex.Array
+    """Q_i(x, a), mean over the agent's critics."""
+    truth: chex.Array
+    """Discounted sum of the agent's rewards, from the state and the action on."""
+
+
+def allocate(state: Any, size: int, spec: Spec) -> Pairs:
+    """`size` pairs that hold nothing yet. state: of one seed's environments, leading axis [num_envs]."""
+    states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:1], (size, *leaf.shape[1:])), state)
+    return Pairs(states, jnp.zeros((size, spec.observation_size + spec.action_size)))
+
+
+def keep(pairs: Pairs, new: Pairs, share: chex.Array, key: chex.PRNGKey) -> Pairs:
+    """`pairs` after one more collect that brought `new`: each is replaced with probability `share`, by one of `new`
+    drawn uniformly.
+
+    share: of `new` in all that was collected since the last evaluation, `new` included; with that every pair is a
+    uniform draw from all of it.
+    """
+    size, number = pairs.inputs.shape[0], new.inputs.shape[0]
+    which_key, draw_key = jax.random.split(key)
+    replaced = jax.random.uniform(which_key, (size,)) < share
+    drawn = jax.random.randint(draw_key, (size,), 0, number)
+
+    def one(old: chex.Array, new: chex.Array) -> chex.Array:
+        return jnp.where(replaced.reshape(size, *[1] * (old.ndim - 1)), new[drawn], old)
+
+    return jax.tree.map(one, pairs, new)
+
+
+def measure(
+    env: Environment,
+    spec: Spec,
+    policy: Policy,
+    critics: Sequence[chex.ArrayTree],
+    pairs: Pairs,
+    key: chex.PRNGKey,
+    steps: int,
+) -> Values:
+    """What the critics (parameters, one stack per group) say of the pairs, and the true values (see `play_out`)."""
+    return Values(estimate(spec, policy, critics, pairs.inputs), play_out(env, spec, policy, pairs, key, steps))
+
+
+def estimate(spec: Spec, policy: Policy, critics: Sequence[chex.ArrayTree], inputs: chex.Array) -> chex.Array:
+    """Q_i(x, a) of every agent, mean over its critics, in the units of its rewards: [pairs, num_agents]."""
+    x, action = jnp.split(inputs, [spec.observation_size], axis=-1)
+    if policy.statistics is not None:
+        x = running_statistics.normalise(policy.statistics, x)
+    values: list[Any] = [None] * spec.num_agents
+    for group, params in zip(spec.groups, critics, strict=True):
+        network = networks.critic_network(group.algorithm.num_critics, group.algorithm.hidden)
+        for k, i in enumerate(group.members):
+            parts = [x, action]
+            if group.algorithm.critic == "own":
+                parts = [spec.observation_part(x, i), spec.action_part(action, i)]
+            own = jax.tree.map(lambda leaf, k=k: leaf[k], params)
+            value = update.apply(network, own, jnp.concatenate(parts, axis=-1))[..., 0].mean(axis=0)
+            values[i] = value / group.algorithm.reward_scale
+    return jnp.stack(values, axis=-1)
+
+
+def play_out(env: Environment, spec: Spec, policy: Policy, pairs: Pairs, key: chex.PRNGKey, steps: int) -> chex.Array:
+    """Discounted sum of each agent's rewards over `steps` env steps, [pairs, num_agents]: one rollout from each pair.
+
+    First the stored action, then the policies that the critics' targets mean: choices sampled, Box actions without
+    noise. Termination ends a rollout; a time limit does not, as targets bootstrap through it. Each agent's rewards are
+    discounted with the gamma of its team.
+    """
+    _, action = jnp.split(pairs.inputs, [spec.observation_size], axis=-1)
+    number = action.shape[0]
+    step_key, noise_key = jax.random.split(key)
+    gamma = jnp.stack([jnp.asarray(policy.hyper[spec.place(i)[0]].gamma) for i in range(spec.num_agents)])
+    # All noise in one draw for each group, not one for each step; None for a Box.
+    noise = tuple(
+        networks.policy_noise(jax.random.fold_in(noise_key, g), group.action_space, (steps, len(group.members), number))
+        for g, group in enumerate(spec.groups)
+    )
+
+    def step(carry, inputs):
+        state, action, going, discount, total = carry
+        draws, keys = inputs
+        after = jax.vmap(env.step)(keys, state, rollout.env_actions(spec, action))
+        total += jnp.where(going[:, None], discount * after.reward, 0)
+        action = rollout.act(spec, policy, after.observation, draws)
+        return (after.state, action, going & ~after.terminated, discount * gamma, total), None
+
+    carry = (
+        pairs.state, action, jnp.ones(number, bool), jnp.ones(spec.num_agents), jnp.zeros((number, spec.num_agents))
+    )  # fmt: skip
+    (*_, total), _ = jax.lax.scan(step, carry, (noise, jax.random.split(step_key, (steps, number))))
+    return total

@@ -1,0 +1,243 @@
+"""Act in the environment: collect transitions for the replay, and evaluate policies. For one seed; `vmap` for more."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from matd3_jax.core import networks, running_statistics, update
+from matd3_jax.core.agents import Spec
+from matd3_jax.core.algorithm import HyperParams
+from matd3_jax.core.running_statistics import Statistics
+from matd3_jax.envs.base import Environment
+
+APART = 2**31 - 1
+"""Folded into a key whose `split` and other `fold_in` never get that far."""
+
+
+class Policy(NamedTuple):
+    """All that acting takes, of one seed."""
+
+    actors: tuple[chex.ArrayTree, ...]
+    """Parameters, one stack per group."""
+    hyper: tuple[HyperParams, ...]
+    """One per group."""
+    statistics: Statistics | None
+    """What observations are normalised by; None: they are not."""
+
+
+class EnvState(NamedTuple):
+    """The environments of one seed, mid-episode; leading axis [num_envs]."""
+
+    state: Any
+    observation: tuple[chex.Array, ...]
+    episode_return: chex.Array
+    """[num_envs, num_agents] reward gathered so far in the running episodes."""
+    episode_step: chex.Array
+    """[num_envs] env steps so far in the running episodes."""
+    noise_quantile: chex.Array | None = None
+    """[num_envs, num_agents] uniform on [0, 1): where in its range each agent's exploration noise is in the running
+    episode. None where no agent has a range (see `ranged`)."""
+
+
+class Episodes(NamedTuple):
+    """Sums over the episodes that ended in a stretch of play."""
+
+    count: chex.Array
+    episode_return: chex.Array
+    """[num_agents] undiscounted."""
+    length: chex.Array
+
+
+class Evaluation(NamedTuple):
+    """Whole episodes, each played in an environment of its own."""
+
+    episode_return: chex.Array
+    """[episodes, num_agents] undiscounted."""
+    length: chex.Array
+    """[episodes] env steps."""
+    measures: chex.Array
+    """[episodes, measures] of the environment (`Environment.measures`), means over the env steps of the episode."""
+
+
+def start(env: Environment, key: chex.PRNGKey, num_envs: int, noise_range: bool = False) -> EnvState:
+    """Fresh episodes in `num_envs` environments; `noise_range`: with noise quantiles."""
+    state, observation = jax.vmap(env.reset)(jax.random.split(key, num_envs))
+    shape = (num_envs, len(env.agents))
+    quantile = jax.random.uniform(jax.random.fold_in(key, APART), shape) if noise_range else None
+    return EnvState(state, observation, jnp.zeros(shape), jnp.zeros(num_envs, jnp.int32), quantile)
+
+
+def ranged(spec: Spec) -> bool:
+    """Whether an agent's exploration noise is drawn from a range."""
+    return any(algorithm.noise_range for algorithm in spec.algorithms)
+
+
+def collect(
+    env: Environment,
+    spec: Spec,
+    policy: Policy,
+    env_state: EnvState,
+    key: chex.PRNGKey,
+    length: int,
+    random: bool = False,
+    keep_states: bool = False,
+    unroll: int = 1,
+) -> tuple[EnvState, chex.Array, Episodes, Any]:
+    """Play `length` steps in every environment with the exploring policies; episodes that end start anew.
+
+    Returns the environments, the replay rows [length * num_envs, row_size] (the true next observation in them, also
+    where an episode ended), what ended on the way, and the state of the environment before each row's action, leading
+    axis [length * num_envs] (None unless `keep_states`).
+
+    random: act uniformly at random instead: warm-up without the policies. unroll: steps that one iteration holds.
+    """
+    num_envs = env_state.episode_step.shape[0]
+    noise_key, step_key, reset_key = jax.random.split(key, 3)
+    # All noise of the stretch in one draw for each group, not one for each step.
+    noise = _noise(spec, noise_key, (length, num_envs), random)
+
+    def step(carry: EnvState, inputs):
+        draws, step_keys, fresh, fresh_quantile = inputs
+        before = carry.state if keep_states else None
+        quantile = 0.5 if carry.noise_quantile is None else carry.noise_quantile
+        action = spec.join_actions(draws) if random else act(spec, policy, carry.observation, draws, quantile)
+        after = jax.vmap(env.step)(step_keys, carry.state, env_actions(spec, action))
+        x, next_x = (jnp.concatenate(o, axis=-1) for o in (carry.observation, after.observation))
+        rows = spec.pack_rows(x, action, after.reward, next_x, after.terminated, after.truncated)
+        returns = carry.episode_return + after.reward
+        steps = carry.episode_step + 1
+        ended = after.terminated | after.truncated
+        episodes = Episodes(
+            ended.sum(), jnp.where(ended[:, None], returns, 0).sum(axis=0), jnp.where(ended, steps, 0).sum()
+        )
+        state, observation, quantile = jax.tree.map(
+            lambda new, old: jnp.where(ended.reshape(ended.shape + (1,) * (old.ndim - 1)), new, old),
+            (*fresh, fresh_quantile),
+            (after.state, after.observation, carry.noise_quantile),
+        )
+        returns, steps = jnp.where(ended[:, None], 0, returns), jnp.where(ended, 0, steps)
+        carry = EnvState(state, observation, returns, steps, quantile)
+        return carry, (rows, episodes, before)
+
+    step_keys, reset_keys = (jax.random.split(k, (length, num_envs)) for k in (step_key, reset_key))
+    # Every step has a fresh start at hand, drawn in one batch: inside the loop they would be as many, drawn one by one.
+    fresh = jax.vmap(jax.vmap(env.reset))(reset_keys)
+    fresh_quantiles = None
+    if env_state.noise_quantile is not None:
+        shape = (length, *env_state.noise_quantile.shape)
+        fresh_quantiles = jax.random.uniform(jax.random.fold_in(noise_key, APART), shape)
+    inputs = (noise, step_keys, fresh, fresh_quantiles)
+    env_state, (rows, episodes, states) = jax.lax.scan(step, env_state, inputs, unroll=unroll)
+    rows, states = jax.tree.map(lambda leaf: leaf.reshape(length * num_envs, *leaf.shape[2:]), (rows, states))
+    return env_state, rows, jax.tree.map(lambda e: e.sum(axis=0), episodes), states
+
+
+def evaluate(
+    env: Environment,
+    spec: Spec,
+    policy: Policy,
+    key: chex.PRNGKey,
+    episodes: int,
+    deterministic: bool,
+) -> Evaluation:
+    """Play `episodes` whole episodes side by side with one policy for all agents; stops as soon as all have ended.
+
+    deterministic: no noise at all (softmax of the logits, likeliest choice, squashed output); otherwise the policies
+    act as they do while collecting.
+    """
+
+    def choose(key, state, observation):
+        return decide(spec, policy, observation, None if deterministic else key)
+
+    return play(env, choose, key, episodes)
+
+
+def play(env: Environment, choose: Callable, key: chex.PRNGKey, episodes: int) -> Evaluation:
+    """Play `episodes` whole episodes side by side; stops as soon as all have ended.
+
+    choose: (key, states, observations) -> actions, as `Environment.reset` gives and `Environment.step` takes them but
+        with a leading axis [episodes].
+    """
+    state_key, step_key = jax.random.split(key)
+    step_keys = jax.random.split(step_key, env.episode_length)
+    env_state = start(env, state_key, episodes)
+
+    def going(carry):
+        t, _, _, running = carry
+        return (t < env.episode_length) & running.any()
+
+    def step(carry):
+        t, env_state, measured, running = carry
+        act_key, env_key = jax.random.split(step_keys[t])
+        actions = choose(act_key, env_state.state, env_state.observation)
+        after = jax.vmap(env.step)(jax.random.split(env_key, episodes), env_state.state, actions)
+        measured += jnp.where(running[:, None], jax.vmap(env.measure)(after.state), 0)
+        env_state = EnvState(
+            after.state,
+            after.observation,
+            env_state.episode_return + jnp.where(running[:, None], after.reward, 0),
+            env_state.episode_step + running,
+        )
+        return t + 1, env_state, measured, running & ~(after.terminated | after.truncated)
+
+    carry = (jnp.int32(0), env_state, jnp.zeros((episodes, len(env.measures))), jnp.ones(episodes, bool))
+    _, env_state, measured, _ = jax.lax.while_loop(going, step, carry)
+    return Evaluation(env_state.episode_return, env_state.episode_step, measured / env_state.episode_step[:, None])
+
+
+def decide(
+    spec: Spec, policy: Policy, observation: Sequence[chex.Array], key: chex.PRNGKey | None
+) -> tuple[chex.Array, ...]:
+    """What each agent does, as `Environment.step` takes it with a leading axis [envs], for one observation
+    [envs, size] per agent. key: of the noise; None: deterministic actions."""
+    draws = None if key is None else _noise(spec, key, observation[0].shape[:1])
+    return env_actions(spec, act(spec, policy, observation, draws))
+
+
+def act(
+    spec: Spec,
+    policy: Policy,
+    observation: Sequence[chex.Array],
+    draws: Sequence[chex.Array | None] | None,
+    noise_quantile: chex.Array | float = 0.5,
+) -> chex.Array:
+    """Joint actions [envs, action_size] for one observation [envs, size] per agent.
+
+    Args:
+        draws: noise [members, envs, action size] per group (see `networks.noise`); None, for one group or all:
+            deterministic actions.
+        noise_quantile: [envs, num_agents] where in its range the exploration noise of an agent that has one is;
+            outside of collecting the middle.
+    """
+    parts, statistics = [], policy.statistics
+    if statistics is not None:
+        observation = [running_statistics.normalise_part(spec, statistics, o, i) for i, o in enumerate(observation)]
+    for g, group in enumerate(spec.groups):
+        stacked = jnp.stack([observation[i] for i in group.members])
+        output = update.apply(update.actor_of(group), policy.actors[g], stacked)
+        draw = None if draws is None else draws[g]
+        scale = policy.hyper[g].exploration_noise
+        if group.algorithm.noise_range:
+            quantile = jnp.broadcast_to(noise_quantile, (stacked.shape[1], spec.num_agents))
+            own = quantile[:, np.array(group.members)].T[..., None]
+            scale = scale + own * (policy.hyper[g].exploration_noise_high - scale)
+        parts.append(networks.act(group.action_space, output, draw, scale, group.algorithm.actor_output))
+    return spec.join_actions(parts)
+
+
+def env_actions(spec: Spec, action: chex.Array) -> tuple[chex.Array, ...]:
+    """What `Environment.step` takes, of joint action vectors [..., action_size]."""
+    return tuple(networks.to_env(space, spec.action_part(action, i)) for i, space in enumerate(spec.action_spaces))
+
+
+def _noise(spec: Spec, key: chex.PRNGKey, shape: tuple[int, ...], random: bool = False) -> tuple[chex.Array, ...]:
+    """Noise [*shape[:-1], members, shape[-1], action size] of every group; `random`: whole random actions instead."""
+    draw = networks.random_action if random else networks.noise
+    return tuple(
+        draw(jax.random.fold_in(key, g), group.action_space, (*shape[:-1], len(group.members), shape[-1]))
+        for g, group in enumerate(spec.groups)
+    )

@@ -1,0 +1,134 @@
+"""Play one episode of one seed and keep what happened: for pictures, and for a closer look from Python."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from matd3_jax.core import networks, rollout
+from matd3_jax.core.agents import Spec
+from matd3_jax.training.loop import TrainState
+from matd3_jax.training.session import Training
+
+
+class Episode(NamedTuple):
+    """An episode, or its beginning: what `play` gives has every frame, from the start to the last env step."""
+
+    step: np.ndarray
+    """[frames] env steps so far."""
+    states: Any
+    """States of the environment, or what `keep` made of them; leading axis [frames]."""
+    returns: dict[str, np.ndarray]
+    """Of each team [frames]: undiscounted return so far (agents weighted by `Environment.return_weights`)."""
+    terminated: bool
+    """The task itself ended with the last step."""
+    truncated: bool
+    """The time limit cut it there."""
+
+    @property
+    def length(self) -> int:
+        """Env steps."""
+        return int(self.step[-1])
+
+    @property
+    def end(self) -> str:
+        """Why the last step is the last."""
+        return "terminated" if self.terminated else "truncated" if self.truncated else "stopped by max_steps"
+
+    @property
+    def result(self) -> str:
+        """The returns in words."""
+        return self._words(-1)
+
+    def at(self, every: int) -> "Episode":
+        """Every n-th frame, and the last."""
+        index = np.append(np.arange(0, len(self.step) - 1, every), len(self.step) - 1)
+        return self._replace(
+            step=self.step[index],
+            states=jax.tree.map(lambda leaf: leaf[index], self.states),
+            returns={team: values[index] for team, values in self.returns.items()},
+        )
+
+    def captions(self) -> list[str]:
+        """For each frame a line with the env step and the returns so far."""
+        return [f"step {step}   {self._words(frame)}" for frame, step in enumerate(self.step)]
+
+    def _words(self, frame: int) -> str:
+        # The sum turns -0.0 into 0.0.
+        values = {team: f"{round(float(values[frame]), 1) + 0.0:.1f}" for team, values in self.returns.items()}
+        if len(values) == 1:
+            return f"return {next(iter(values.values()))}"
+        return "return: " + ", ".join(f"{team} {value}" for team, value in values.items())
+
+
+def play(
+    training: Training,
+    state: TrainState,
+    seed: int = 0,
+    number: int = 0,
+    deterministic: bool = True,
+    max_steps: int | None = None,
+    keep: Callable[[Any], Any] = lambda state: state,
+) -> Episode:
+    """Play an episode with the policies of one seed.
+
+    Deterministic, it is the episode `number` of those that `Training.evaluate` (and the command `evaluate`) plays with
+    its default seed.
+
+    Args:
+        state: what was trained, leading axis [seeds].
+        seed: place of the seed in the run, from 0.
+        deterministic: no noise at all; otherwise the policies act as they do while collecting.
+        max_steps: stop after so many env steps.
+        keep: what to keep of a state of the environment; by default all of it.
+    """
+    steps = training.env.episode_length if max_steps is None else min(max_steps, training.env.episode_length)
+    trainer = training.trainer
+    # Through the host: the seeds may lie on different devices.
+    policy = jax.device_get(jax.tree.map(lambda leaf: leaf[seed], trainer.policy(state, average=deterministic)))
+    env, spec = training.env, training.spec
+
+    def run(policy, key):
+        state_key, step_key = jax.random.split(key)
+        first, observation = env.reset(jax.random.split(state_key, number + 1)[number])
+
+        def step(carry, key):
+            state, observation = carry
+            act_key, env_key = jax.random.split(key)
+            draws = None if deterministic else _noise(spec, act_key)
+            action = rollout.act(spec, policy, [o[None] for o in observation], draws)
+            actions = tuple(a[0] for a in rollout.env_actions(spec, action))
+            after = env.step(jax.random.split(env_key, number + 1)[number], state, actions)
+            kept = (keep(after.state), after.reward, after.terminated, after.truncated)
+            return (after.state, after.observation), kept
+
+        keys = jax.random.split(step_key, env.episode_length)[:steps]
+        _, (later, *rest) = jax.lax.scan(step, (first, observation), keys)
+        states = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), keep(first), later)
+        return states, *rest
+
+    # The key of `Training.evaluate` with its default seed.
+    key = jax.random.fold_in(jax.random.key(0), 2**31 - 1)
+    states, reward, terminated, truncated = jax.jit(run)(policy, key)
+    ended = np.flatnonzero(np.asarray(terminated | truncated))
+    length = int(ended[0]) + 1 if len(ended) else steps
+    so_far = np.cumsum(np.asarray(reward, np.float64)[:length], axis=0)
+    so_far = np.concatenate([np.zeros((1, spec.num_agents)), so_far])
+    return Episode(
+        step=np.arange(length + 1),
+        states=jax.tree.map(lambda leaf: leaf[: length + 1], states),
+        returns={team: so_far @ training.team_weights(team) for team in dict.fromkeys(spec.teams)},
+        terminated=bool(terminated[length - 1]),
+        truncated=bool(truncated[length - 1]),
+    )
+
+
+def _noise(spec: Spec, key: chex.PRNGKey) -> tuple[chex.Array, ...]:
+    """Exploration noise [members, 1, action size] of every group."""
+    return tuple(
+        networks.noise(jax.random.fold_in(key, g), group.action_space, (len(group.members), 1))
+        for g, group in enumerate(spec.groups)
+    )

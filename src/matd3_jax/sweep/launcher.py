@@ -1,0 +1,72 @@
+"""Pieces of a sweep as jobs of a Hydra launcher: on a SLURM cluster, in local processes, one after another.
+
+`python -m matd3_jax.sweep.launcher --multirun sweep=SWEEP_DIR piece=0,1,2 hydra/launcher=submitit_slurm` is what
+`launch` runs.
+"""
+
+import dataclasses
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import hydra
+from hydra.core.config_store import ConfigStore
+from hydra.core.plugins import Plugins
+from omegaconf import MISSING
+
+from matd3_jax.envs.base import nearest
+from matd3_jax.errors import UserError
+
+
+@dataclasses.dataclass
+class Job:
+    """One piece of a sweep."""
+
+    sweep: str = MISSING
+    piece: int = MISSING
+
+
+ConfigStore.instance().store(name="matd3_jax_job", node=Job)
+
+
+def check(launcher: str, options: Sequence[str]) -> None:
+    """Raise UserError where no such launcher is installed, or it has no such option ("launcher.KEY=value")."""
+    Plugins.instance()  # finds the plugins, which register their configurations
+    known = ConfigStore.instance().list("hydra/launcher")
+    if f"{launcher}.yaml" not in known:
+        hint = "; pip install hydra-submitit-launcher" if launcher.startswith("submitit") else ""
+        raise UserError(
+            f"no launcher is called {launcher!r}; {nearest(launcher, [n.removesuffix('.yaml') for n in known])}{hint}"
+        )
+    keys = ConfigStore.instance().load(f"hydra/launcher/{launcher}.yaml").node
+    for option in options:
+        key = option.removeprefix("launcher.").split("=")[0]
+        if key.split(".")[0] not in keys:
+            raise UserError(f"the launcher {launcher} has no option {key!r}; {nearest(key, map(str, keys))}")
+
+
+def launch(folder: Path, pieces: int, launcher: str, options: Sequence[str]) -> int:
+    """Train the pieces of the sweep in `folder` as jobs and wait for them: the exit code.
+
+    Args:
+        options: "launcher.KEY=value", the launcher's own.
+    """
+    folder = folder.resolve()
+    command = [sys.executable, "-m", "matd3_jax.sweep.launcher", "--multirun", f"sweep='{folder}'"]
+    command += [f"piece={','.join(map(str, range(pieces)))}", f"hydra/launcher={launcher}"]
+    command += [f"hydra.sweep.dir='{folder / 'jobs'}'", "hydra.sweep.subdir=${piece}"]
+    command += [f"hydra.{option}" for option in options]
+    return subprocess.run(command).returncode
+
+
+@hydra.main(version_base=None, config_path=None, config_name="matd3_jax_job")
+def job(config: Job) -> int:
+    """Train one piece."""
+    from matd3_jax.cli import command, sweep
+
+    return command.code(sweep.main, [f"resume='{config.sweep}'", f"piece={config.piece}"])
+
+
+if __name__ == "__main__":
+    job()

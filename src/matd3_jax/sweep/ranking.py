@@ -1,0 +1,116 @@
+"""The settings of a sweep in the order of what they came to."""
+
+import csv
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from matd3_jax.envs.base import nearest
+from matd3_jax.errors import UserError
+from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.stats.intervals import mean_interval
+
+
+@dataclasses.dataclass(frozen=True)
+class Ranked:
+    """What one setting came to; arrays [seeds]."""
+
+    name: str
+    values: Mapping[str, str]
+    """Swept keys."""
+    seeds: np.ndarray
+    final: np.ndarray
+    """Mean of the metric over the last tenth of the run."""
+    area: np.ndarray
+    """Mean of the metric over the whole run after the first row: the area under the curve for each env step."""
+    diverged: np.ndarray
+    """Whether the seed's critics ended with numbers that are not finite."""
+
+    def interval(self, which: str) -> tuple[float, float]:
+        """Mean and half width of its 95 % interval (t) of "final" or "area" over the seeds that did not diverge."""
+        values = getattr(self, which)[~self.diverged]
+        if not values.size:
+            return np.nan, np.nan
+        mean, half = mean_interval(values)
+        return float(mean), float(half)
+
+
+def rank(folder: Path, runs: Mapping[str, Sequence[str]], settings: Mapping[str, Mapping], metric: str) -> list[Ranked]:
+    """The settings of finished runs, best final mean first; settings with diverged seeds after those without.
+
+    Args:
+        folder: where the run directories are; runs: their names by setting.
+        settings: swept values by setting.
+
+    Raises UserError where the metrics tables have no column `metric`.
+    """
+    rows = []
+    for name, values in settings.items():
+        seeds, final, area, diverged = [], [], [], []
+        for run in runs[name]:
+            table = RunDirectory(folder / run).read_metrics()
+            if metric not in table:
+                raise UserError(f"metric={metric}: the metrics table has no such column; {nearest(metric, table)}")
+            for seed in np.unique(table["seed"]):
+                there = table["seed"] == seed
+                steps, curve = table["step"][there], table[metric][there]
+                late = steps > 0.9 * steps[-1]
+                seeds.append(int(seed))
+                final.append(_mean(curve[late]))
+                area.append(_mean(curve[1:]))
+                ends = [v[there][-1] for n, v in table.items() if n.endswith(("_critic_loss", "_q_value"))]
+                diverged.append(not np.isfinite(ends).all())
+        rows.append(Ranked(name, values, np.array(seeds), np.array(final), np.array(area), np.array(diverged)))
+
+    def order(row: Ranked) -> tuple[float, float]:
+        mean = row.interval("final")[0]
+        return float(row.diverged.mean()), -mean if np.isfinite(mean) else np.inf
+
+    return sorted(rows, key=order)
+
+
+def show(rows: Sequence[Ranked], title: str, most: int = 30) -> None:
+    """Print the best `most` settings."""
+    table = Table(title=f"{title}, mean ± 95 % interval over seeds")
+    for heading in ("rank", *rows[0].values, "seeds", "diverged", "final", "area under the curve"):
+        table.add_column(heading, justify="right")
+    for k, row in enumerate(rows[:most]):
+        cells = [_interval(row.interval(which)) for which in ("final", "area")]
+        diverged = str(row.diverged.sum()) if row.diverged.any() else "-"
+        table.add_row(str(k + 1), *row.values.values(), str(len(row.seeds)), diverged, *cells)
+    Console(width=None if Console().is_terminal else 200).print(table)
+    if len(rows) > most:
+        print(f"and {len(rows) - most} more settings")
+
+
+def write(folder: Path, rows: Sequence[Ranked]) -> None:
+    """Leave table.csv (a row each setting) and seeds.csv (a row each setting and seed)."""
+    keys = list(rows[0].values)
+    with (folder / "table.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        intervals = ("final_mean", "final_interval", "area_mean", "area_interval")
+        writer.writerow(("rank", "setting", *keys, "seeds", "diverged", *intervals))
+        for k, row in enumerate(rows):
+            numbers = [f"{x:.6g}" for which in ("final", "area") for x in row.interval(which)]
+            writer.writerow((k + 1, row.name, *row.values.values(), len(row.seeds), row.diverged.sum(), *numbers))
+    with (folder / "seeds.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(("rank", "setting", *keys, "seed", "diverged", "final", "area"))
+        for k, row in enumerate(rows):
+            for seed, diverged, final, area in zip(row.seeds, row.diverged, row.final, row.area, strict=True):
+                numbers = [f"{final:.6g}", f"{area:.6g}"]
+                writer.writerow((k + 1, row.name, *row.values.values(), seed, int(diverged), *numbers))
+
+
+def _mean(values: np.ndarray) -> float:
+    there = values[~np.isnan(values)]  # no episode need have ended in a chunk
+    return float(there.mean()) if there.size else np.nan
+
+
+def _interval(found: tuple[float, float]) -> str:
+    mean, half = found
+    return f"{mean:.4g}" + (f" ± {half:.2g}" if np.isfinite(half) else "")

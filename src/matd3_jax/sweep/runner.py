@@ -1,0 +1,244 @@
+"""Train many settings: runs that can share a program side by side in it, piece after piece.
+
+A folder holds `runs/NAME/`, an ordinary run directory for each run, `pieces.json` (which runs are trained together)
+and, while a piece is at work, `pieces/K/` with its checkpoints. Each piece can be trained by a process of its own.
+"""
+
+import contextlib
+import fcntl
+import json
+import shutil
+import time
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from matd3_jax.config import Config
+from matd3_jax.errors import UserError
+from matd3_jax.figures import learning_curves, q_bias
+from matd3_jax.runs import overestimation, summary
+from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.runtime import devices
+from matd3_jax.runtime.multihost import ALONE, Processes
+from matd3_jax.runtime.signals import Stop
+from matd3_jax.sweep import batching
+from matd3_jax.training import checkpoint
+from matd3_jax.training.loop import TrainState
+from matd3_jax.training.memory import fitting_seeds, needed
+from matd3_jax.training.progress import ProgressBar
+from matd3_jax.training.session import Row, Training
+
+
+class Sweep:
+    """The runs of a folder and their pieces.
+
+    Args:
+        processes: which train every piece together, its seeds shared out among them (among as many as there are
+            seeds); the first of them plans, and writes all but the others' part of checkpoints.
+    """
+
+    def __init__(self, folder: Path, processes: Processes = ALONE):
+        self.folder, self.processes = folder, processes
+        self.runs = folder / "runs"
+        self._plan = folder / "pieces.json"
+
+    @property
+    def pieces(self) -> list[list[str]]:
+        """Names of the runs in each piece."""
+        return json.loads(self._plan.read_text()) if self._plan.exists() else []
+
+    def add(self, settings: Mapping[str, Config], budget: int | None = None) -> dict[str, list[Path]]:
+        """Plan what is missing of `settings` (by name): the directories of each setting's runs, those already there
+        among them.
+
+        Args:
+            budget: bytes that a piece may take in each process; None: what is free now.
+
+        Raises UserError where a setting is impossible, or one seed of it does not fit.
+        """
+        budget = devices.free_memory(self.processes.here) if budget is None else budget
+        size = self.processes.size
+        existing = batching.existing_runs(self.runs)
+        new = batching.pieces(settings, existing, self.runs, lambda config: size * fitting_seeds(config, budget))
+        machine = {"versions": devices.versions(), **devices.description()}
+        for config in (config for piece in new for config in piece):
+            RunDirectory.create(self.runs / str(config.name), config, machine)
+        if new:
+            whole = [*self.pieces, *([str(config.name) for config in piece] for piece in new)]
+            partial = self._plan.with_suffix(".partial")
+            partial.write_text(json.dumps(whole, indent=1) + "\n")
+            partial.replace(self._plan)
+        existing = batching.existing_runs(self.runs)
+        return {name: [self.runs / run for run in batching.missing(c, existing)[0]] for name, c in settings.items()}
+
+    def finished(self, piece: int) -> bool:
+        """Whether all runs of a piece are."""
+        return all((self.runs / name / "summary.json").exists() for name in self.pieces[piece])
+
+    def train(self, only: Collection[int] | None = None) -> int:
+        """Train the unfinished pieces, or those of `only`: the exit code, 0 or 128 + the signal that ended it.
+
+        Pieces at which another process works are passed over.
+        """
+        stop = Stop()
+        todo = [k for k in range(len(self.pieces)) if not self.finished(k) and (only is None or k in only)]
+        for k in self.processes.tell(todo):
+            with self._taken(k) as mine:
+                if self.processes.tell(mine and not self.finished(k)):
+                    together = self.processes.part(sum(member.seeds for member in self.members(k)))
+                    if together is not None:
+                        Piece(self, k, together).train(stop)
+                stopped = stop.agreed(self.processes)
+            if stopped is not None:
+                return 128 + stopped
+        return 0
+
+    def members(self, piece: int) -> list[Config]:
+        """Settings of the runs in a piece."""
+        return [RunDirectory.open(self.runs / name)[1] for name in self.pieces[piece]]
+
+    @contextlib.contextmanager
+    def _taken(self, piece: int) -> Iterator[bool]:
+        """Whether these processes have the piece to themselves now; the first takes it for all."""
+        if not self.processes.first:
+            yield False
+            return
+        place = self.folder / "pieces" / str(piece)
+        place.mkdir(parents=True, exist_ok=True)
+        with (place / "lock").open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                print(f"piece {piece}: another process is at it, passed over", flush=True)
+                yield False
+                return
+            yield True
+        if self.finished(piece):
+            shutil.rmtree(place, ignore_errors=True)
+
+
+class Piece:
+    """Runs side by side in one program, in one process or several."""
+
+    def __init__(self, sweep: Sweep, number: int, processes: Processes = ALONE):
+        self.sweep, self.number, self.processes = sweep, number, processes
+        self.runs = [RunDirectory(sweep.runs / name) for name in sweep.pieces[number]]
+        self.members = sweep.members(number)
+        self.training = Training(self.members[0], members=self.members, processes=processes)
+        self.checkpoints = sweep.folder / "pieces" / str(number) / "checkpoints"
+        ends = np.cumsum([config.seeds for config in self.members])
+        self.seeds = [slice(end - config.seeds, end) for end, config in zip(ends.tolist(), self.members, strict=True)]
+        """Where each run's seeds are."""
+
+    def train(self, stop: Stop) -> None:
+        """From the last checkpoint, or from the start, to the end or until a signal comes."""
+        training, settings, begun = self.training, self.members[0], time.monotonic()
+        training.check_memory()
+        if self.processes.first:
+            self._announce()
+        state, row = self._begin()
+        step = saved = int(row["step"][0])
+        every = training.total_steps / 5 if settings.checkpoint_every is None else settings.checkpoint_every
+        progress = ProgressBar(training, row) if self.processes.first else None
+
+        def save() -> None:
+            checkpoint.save(self.checkpoints, step, training.trainer, state, keep=1, share=training.share)
+
+        try:
+            stopped = stop.agreed(self.processes)
+            while step < training.total_steps and stopped is None:
+                state, row = training.advance(state)
+                step = int(row["step"][0])
+                if progress is not None:
+                    self._append(row)
+                    progress.show(row)
+                if every and step - saved >= every and step < training.total_steps:
+                    save()
+                    saved = step
+                stopped = stop.agreed(self.processes)
+        finally:
+            if progress is not None:
+                progress.stop()
+        if step < training.total_steps:
+            save()
+            return
+        rates = {} if progress is None else progress.rates()
+        self._finish(state, row, {"seconds": round(time.monotonic() - begun, 1), **rates})
+
+    def _begin(self) -> tuple[TrainState, Row]:
+        first, tell = self.processes.first, self.processes.tell
+        if not tell(bool(checkpoint.steps(self.checkpoints)) if first else None):
+            for run in self.runs if first else ():
+                run.clear()
+            state, row = self.training.start()
+            if first:
+                self._append(row)
+            return state, row
+        saved = Path(tell(str(checkpoint.verify(self.checkpoints)) if first else None))
+        state, done = checkpoint.restore(saved, self.training.trainer, self.training.share), int(saved.name)
+        self.processes.barrier()
+        for run in self.runs if first else ():
+            run.cut(done)
+        if first:
+            print(f"going on from the checkpoint of env step {done:,}", flush=True)
+        updates = self.training.trainer.updates(int(state.collects))
+        return state, {"step": np.array([done]), "updates": np.array([updates])}
+
+    def _append(self, row: Row) -> None:
+        for run, seeds in zip(self.runs, self.seeds, strict=True):
+            run.append({name: values[seeds] for name, values in row.items()})
+
+    def _finish(self, state: TrainState, row: Row, facts: Mapping[str, Any]) -> None:
+        """Leave each run as if it had been trained alone, but for its replay."""
+        trainer, share = self.training.trainer, self.training.share
+        facts = {**facts, "side_by_side": share.total}
+        for run, config, seeds in zip(self.runs, self.members, self.seeds, strict=True):
+            checkpoint.save(run.checkpoints, int(row["step"][0]), trainer, state, keep=1, seeds=seeds, share=share)
+            if not self.processes.first:
+                continue
+            metrics = run.read_metrics()
+            learning_curves.learning_curve(run.curve, metrics, str(config.name))
+            whole = summary.summary(metrics, {n: values[seeds] for n, values in row.items()}, **facts)
+            if config.diagnostics.q_bias:
+                whole["overestimation"] = overestimation.summary(metrics, self.training.spec.agents)
+                q_bias.draw(run.q_bias, metrics, self.training.spec.by_team(), str(config.name))
+            run.write_summary(whole)
+
+    def _announce(self) -> None:
+        training, config = self.training, self.members[0]
+        seeds, mesh, size = training.share.total, training.trainer.mesh, self.processes.size
+        several = f" in each of {size} processes" if size > 1 else ""
+        names = [str(member.name) for member in self.members]
+        shown = ", ".join(names if len(names) <= 4 else [*names[:2], "...", names[-1]])
+        print(f"piece {self.number} ({self.number + 1} of {len(self.sweep.pieces)}): {len(names)} runs, {seeds} seeds "
+              f"in all, on {mesh.size} x {mesh.devices.flat[0].device_kind}{several}: {shown}")  # fmt: skip
+        print(f"{config.env['name']}, {training.total_steps:,} env steps each; {training.memory}; "
+              f"{needed(training.trainer, len(training.seeds)) / 1e9:.2f} GB in all", flush=True)  # fmt: skip
+
+
+class Stopped(Exception):
+    """A signal ended the training; `code` is the exit code."""
+
+    def __init__(self, code: int):
+        self.code = code
+
+
+def train(settings: Mapping[str, Config], folder: Path, budget: int | None = None) -> dict[str, list[Path]]:
+    """Train what is missing of `settings` (by name) in `folder`: the directories of each setting's finished runs.
+
+    The same call goes on where it was stopped, and finished runs are used as they are. `budget`: as for `Sweep.add`.
+    Raises UserError, and Stopped when a signal ended the training.
+    """
+    sweep = Sweep(folder)
+    runs = sweep.add(settings, budget)
+    wanted = [path for paths in runs.values() for path in paths]
+    names = {path.name for path in wanted}
+    code = sweep.train([k for k, piece in enumerate(sweep.pieces) if names & set(piece)])
+    if code:
+        raise Stopped(code)
+    for path in wanted:
+        if not (path / "summary.json").exists():
+            raise UserError(f"{path} is not finished, and not here to be: another process is at it, or none knows it")
+    return runs

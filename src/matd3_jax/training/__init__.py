@@ -1,0 +1,1 @@
+"""One run: its schedule, loop, session, checkpoints and progress."""

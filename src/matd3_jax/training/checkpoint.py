@@ -1,0 +1,212 @@
+"""Checkpoints: everything a run carries, written with Orbax, checked by checksum before it is read back.
+
+Layout of one: `STEP/state` (all but the replay; several processes write `STEP/state/FIRST`, each its seeds, from number
+FIRST on), `STEP/replay/SEED` (the rows filled so far; none in what a sweep leaves of its runs), `STEP/checksums.json`.
+A checkpoint appears under its name only when it is whole. The replay is written and read one seed at a time, so that it
+never stands in memory twice. What some processes wrote any other number of them can read.
+"""
+
+import hashlib
+import json
+import logging
+import shutil
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+
+from matd3_jax.core import replay
+from matd3_jax.errors import UserError
+from matd3_jax.runtime.multihost import ALONE, Share
+from matd3_jax.training.loop import Trainer, TrainState
+
+logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax tells of every step at INFO and warns of its own defaults.
+
+
+def save(
+    folder: Path,
+    step: int,
+    trainer: Trainer,
+    state: TrainState,
+    keep: int,
+    seeds: slice | None = None,
+    share: Share | None = None,
+) -> Path:
+    """Write the checkpoint of env step `step` and delete all but the newest `keep`.
+
+    Args:
+        seeds: write these seeds' part alone, without their replay: enough to evaluate them, not to go on. None: all.
+        share: which seeds the trainer has. Every process writes its own, the first makes a checkpoint of it. None:
+            there are no others.
+    """
+    share = share or ALONE.share(trainer.num_seeds)
+    processes, wanted = share.processes, seeds or slice(0, share.total)
+    folder = folder.resolve()
+    final, partial_ = folder / str(step), folder / f".{step}.partial"
+    if processes.first:
+        shutil.rmtree(partial_, ignore_errors=True)
+        partial_.mkdir(parents=True)
+    processes.barrier()
+    written = []
+    first, last = max(share.first, wanted.start), min(share.last, wanted.stop)
+    with ocp.StandardCheckpointer() as checkpointer:
+        if first < last:
+            written.append(partial_ / "state")
+            if last - first < wanted.stop - wanted.start:
+                written[0] /= str(first - wanted.start)
+            own = slice(first - share.first, last - share.first)
+            checkpointer.save(written[0], _leaves(trainer, state, own))
+        for seed, rows in _replay_rows(trainer, state) if seeds is None else ():
+            written.append(partial_ / "replay" / str(share.first + seed))
+            checkpointer.save(written[-1], {"rows": rows})
+            checkpointer.wait_until_finished()
+    parts = processes.collect(json.dumps(_checksums(partial_, written)).encode())
+    if processes.first:
+        checksums = dict(sorted(pair for part in parts for pair in json.loads(part).items()))
+        (partial_ / "checksums.json").write_text(json.dumps(checksums, indent=1))
+        shutil.rmtree(final, ignore_errors=True)
+        partial_.rename(final)
+        for old in steps(folder)[:-keep]:
+            shutil.rmtree(folder / str(old))
+    return final
+
+
+def steps(folder: Path) -> list[int]:
+    """Env steps of the whole checkpoints in `folder`, ascending."""
+    if not folder.is_dir():
+        return []
+    return sorted(int(path.name) for path in folder.iterdir() if path.name.isdigit() and path.is_dir())
+
+
+def verify(folder: Path, step: int | None = None) -> Path:
+    """The checkpoint of env step `step` (None: the last). Raises UserError if it is missing or damaged; the message
+    names the damaged file, and the checkpoint before it."""
+    found = steps(folder)
+    if not found:
+        raise UserError(f"{folder} holds no checkpoint")
+    step = found[-1] if step is None else step
+    if step not in found:
+        raise UserError(f"{folder} holds no checkpoint of step {step}; there: {', '.join(map(str, found))}")
+    path = folder.resolve() / str(step)
+    try:
+        wanted = json.loads((path / "checksums.json").read_text())
+        damaged = next((name for name, digest in wanted.items() if _digest(path / name) != digest), None)
+    except (OSError, ValueError, AttributeError):
+        damaged = "checksums.json"
+    if damaged is not None:
+        before = [other for other in found if other < step]
+        hint = f"go on from the one before it with checkpoint={before[-1]}" if before else "there is none before it"
+        raise UserError(f"the checkpoint {folder / str(step)} is damaged ({damaged}); {hint}")
+    return path
+
+
+def restore(path: Path, trainer: Trainer, share: Share | None = None) -> TrainState:
+    """The state in the checkpoint at `path`, as `verify` gave it. Raises UserError if it holds no replay or does not
+    fit the trainer.
+
+    share: which of the checkpoint's seeds the trainer has; None: all.
+    """
+    if not (path / "replay").is_dir():
+        raise UserError(f"{path} holds no replay: what a sweep leaves of a run can be evaluated, not gone on with")
+    share = share or ALONE.share(trainer.num_seeds)
+    small = _rebuild(trainer, path, share)
+    with ocp.StandardCheckpointer() as checkpointer:
+        filled = trainer.filled_rows(int(small.collects))
+        local = []
+        for device, seeds in trainer.device_seeds():
+            shape = (len(seeds), trainer.schedule.replay_capacity, trainer.spec.row_size)
+            rows = jax.device_put(jnp.zeros(shape, jnp.float32, device=device), device)
+            for place, seed in enumerate(seeds):
+                one = np.asarray(checkpointer.restore(path / "replay" / str(share.first + seed))["rows"])
+                if one.shape[0] > shape[1] or one.shape[0] < filled or one.shape[1] != shape[2]:
+                    raise UserError(f"{path}: a replay of shape {one.shape} does not fit these settings")
+                rows = _put_rows(rows, jax.device_put(one[None], device), place)
+            local.append(rows)
+    shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.spec.row_size)
+    rows = jax.make_array_from_single_device_arrays(shape, trainer.shardings.replay, local)
+    return small._replace(replay=rows)
+
+
+def restore_actors(path: Path, trainer: Trainer) -> TrainState:
+    """The state without its replay (an empty one in its place): enough to evaluate."""
+    return _rebuild(trainer, path, ALONE.share(trainer.num_seeds))
+
+
+def read_state(path: Path, first: int, last: int, total: int) -> dict[str, np.ndarray]:
+    """Leaves of the state by path, with the seeds from number `first` to before `last` of the checkpoint's `total`."""
+    starts = sorted(int(part.name) for part in (path / "state").iterdir() if part.name.isdigit())
+    ends = [*starts[1:], total] if starts else [total]
+    found: list[dict[str, np.ndarray]] = []
+    with ocp.StandardCheckpointer() as checkpointer:
+        for start, end in zip(starts or [0], ends, strict=True):
+            if first < end and start < last:
+                saved = checkpointer.restore(path / "state" / str(start) if starts else path / "state")
+                leaves = {name: np.asarray(leaf) for name, leaf in saved.items()}
+                if any(leaf.ndim and len(leaf) != end - start for leaf in leaves.values()):
+                    raise UserError(f"{path} has other seeds than these settings")
+                own = slice(max(first - start, 0), last - start)
+                found.append({name: leaf[own] if leaf.ndim else leaf for name, leaf in leaves.items()})
+    return {
+        name: np.concatenate([part[name] for part in found]) if leaf.ndim else leaf for name, leaf in found[0].items()
+    }
+
+
+@partial(jax.jit, donate_argnums=0, static_argnums=2)
+def _put_rows(rows: jax.Array, one: jax.Array, place: int) -> jax.Array:
+    return jax.lax.dynamic_update_slice(rows, one, (place, 0, 0))
+
+
+def _replay_rows(trainer: Trainer, state: TrainState):
+    """(seed number, its filled rows) one after the other."""
+    filled = trainer.filled_rows(int(state.collects))
+    for shard in state.replay.addressable_shards:
+        if shard.replica_id:
+            continue  # a copy on another device that works on the same seeds
+        first = shard.index[0].start or 0
+        for place in range(shard.data.shape[0]):
+            if first + place < trainer.num_seeds:
+                yield first + place, np.asarray(shard.data[place, :filled])
+
+
+def _leaves(trainer: Trainer, state: TrainState, seeds: slice) -> dict[str, np.ndarray]:
+    """All leaves but the replay by path, keys as their data, without the copies that fill up the devices; `seeds` of
+    them."""
+    plain = state._replace(replay=None, key=jax.random.key_data(state.key))  # type: ignore[arg-type]
+    found = jax.tree_util.tree_flatten_with_path(plain)[0]
+    whole = {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in found}
+    return {name: leaf[: trainer.num_seeds][seeds] if leaf.ndim else leaf for name, leaf in whole.items()}
+
+
+def _rebuild(trainer: Trainer, path: Path, share: Share) -> TrainState:
+    saved = read_state(path, share.first, share.last, share.total)
+    template = trainer.abstract_state()
+    shape = jax.eval_shape(jax.random.key_data, template.key)
+    template = template._replace(replay=None, key=shape)  # type: ignore[arg-type]
+    names, treedef = jax.tree_util.tree_flatten_with_path(template)
+    leaves = []
+    for name, leaf in names:
+        value = saved.get(jax.tree_util.keystr(name), np.array(np.nan))
+        wanted = (trainer.num_seeds, *leaf.shape[1:]) if leaf.ndim else ()
+        if value.shape != wanted or value.dtype != leaf.dtype:
+            raise UserError(f"{path}: {jax.tree_util.keystr(name)} does not fit these settings")
+        leaves.append(value if not leaf.ndim else np.asarray(trainer.fill(value)))
+    state = jax.tree.unflatten(treedef, leaves)
+    state = state._replace(
+        key=jax.random.wrap_key_data(jnp.asarray(state.key)), replay=replay.allocate(trainer.rows, 0, 0)
+    )
+    return jax.device_put(state, trainer.shardings)
+
+
+def _checksums(path: Path, folders: Sequence[Path]) -> dict[str, str]:
+    """Digests of all files in `folders`, by their names from `path` on."""
+    files = (file for folder in folders for file in folder.rglob("*") if file.is_file())
+    return {str(file.relative_to(path)): _digest(file) for file in files}
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,214 @@
+"""How long a run is going to take, said before it starts: its matrix products, counted, at a rate measured here."""
+
+import functools
+import time
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import NamedSharding
+from jax.sharding import PartitionSpec as P
+
+from matd3_jax.core import update
+from matd3_jax.core.agents import Group, Spec
+from matd3_jax.envs.base import Environment
+from matd3_jax.training.schedule import Schedule
+from matd3_jax.training.session import Training
+
+REACHED = 0.6
+"""Share of the rate of its products that the whole loop reaches (docs/performance.md: 0.54 to 0.72)."""
+
+MJX_STEPS = {"mjx": 1319.0, "mjx_fast": 11001.0}
+"""Env steps/s of one core, of the Ant in 16 environments (docs/performance.md, Robots): measuring it here would mean
+compiling MJX."""
+
+
+# ---- counted ---------------------------------------------------------------------------------------------------------
+
+
+def acting_flops(spec: Spec) -> float:
+    """Floating point operations of the policies' matrix products in one env step of one seed."""
+    return 2.0 * sum(len(group.members) * _forward(_actor(group)) for group in spec.groups)
+
+
+def update_flops(spec: Spec, schedule: Schedule) -> float:
+    """Floating point operations of the matrix products in one update of one seed, all agents, actors counted as often
+    as they move."""
+    return 2.0 * schedule.batch_size * sum(len(g.members) * _member(spec, schedule, g) for g in spec.groups)
+
+
+def step_flops(spec: Spec, schedule: Schedule) -> float:
+    """Floating point operations of the matrix products in one env step of one seed once it learns."""
+    updates = schedule.updates_per_collect / schedule.collect_steps
+    return acting_flops(spec) + updates * update_flops(spec, schedule)
+
+
+def _member(spec: Spec, schedule: Schedule, group: Group) -> float:
+    """Multiplications of one agent's update, for each transition: see `update._update_agent`."""
+    algorithm, size = group.algorithm, group.action_space.size
+    actor, critic = _actor(group), (update.critic_input_size(spec, group), *group.algorithm.hidden, 1)
+    target_actions = _forward(actor)
+    if algorithm.critic == "central":
+        target_actions = sum(len(other.members) * _forward(_actor(other)) for other in spec.groups)
+        if schedule.shared_minibatch and not schedule.sequential:
+            target_actions /= len(group.members)
+    # The targets' values, the critics' own, their gradients.
+    critics = algorithm.num_critics * (3 * _forward(critic) + _inputs(critic))
+    # Through the first critic back to the own action: its part of the first layer's inputs, once each way.
+    through = _forward(critic) + _inputs(critic) + 2 * size * critic[1]
+    actors = 2 * _forward(actor) + _inputs(actor) + through
+    return target_actions + critics + actors / algorithm.policy_delay
+
+
+def _actor(group: Group) -> tuple[int, ...]:
+    return group.observation_size, *group.algorithm.hidden, group.action_space.size
+
+
+def _forward(sizes: Sequence[int]) -> float:
+    """Multiplications of a perceptron with layers of these sizes, for each row; its kernels' gradients take as many."""
+    return sum(i * o for i, o in pairwise(sizes))
+
+
+def _inputs(sizes: Sequence[int]) -> float:
+    """Of the gradients of all layers' inputs but the first's; a layer with one output only scales its kernel."""
+    return sum(i * o for i, o in list(pairwise(sizes))[1:] if o > 1)
+
+
+# ---- measured --------------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def product_rate(devices: tuple[jax.Device, ...], batch: int, inputs: int, outputs: int) -> float:
+    """Floating point operations a second of all devices at once, in a layer's products of float32: forward, and the
+    kernel's gradient. Takes some 0.3 s, most of it measuring."""
+    mesh = jax.sharding.Mesh(np.array(devices), ("devices",))
+
+    def products(count, x, kernel):
+        # Each product needs the one before it, so that none can be left out.
+        return jax.lax.fori_loop(0, count, lambda _, w: w - 1e-3 * (x[0].T @ (x[0] @ w)), kernel[0])[None]
+
+    specs = (P(), P("devices"), P("devices"))
+    program = jax.jit(jax.shard_map(products, mesh=mesh, in_specs=specs, out_specs=P("devices"), check_vma=False))
+    x, kernel = (
+        jax.device_put(np.full((len(devices), *shape), 0.01, np.float32), NamedSharding(mesh, P("devices")))
+        for shape in ((batch, inputs), (inputs, outputs))
+    )
+
+    count, taken = _repeated(lambda count: program(jnp.int32(count), x, kernel), 0.2)
+    return 4 * len(devices) * count * batch * inputs * outputs / taken
+
+
+def physics_rate(env: Environment, devices: tuple[jax.Device, ...], robots: int) -> float | None:
+    """Env steps/s of a robot's physics on one core of a CPU, all devices at once; None where it is not known.
+
+    Args:
+        robots: that each device steps together.
+    """
+    robot = innermost(env)
+    physics = getattr(robot, "physics", None)
+    if physics == "c" and hasattr(robot, "_engine"):
+        return _c_rate(robot, devices, robots)
+    return MJX_STEPS.get(str(physics))
+
+
+def innermost(env: Any) -> Any:
+    """The environment itself, out of all that wraps it."""
+    while hasattr(env, "env"):
+        env = env.env
+    return env
+
+
+def _c_rate(robot: Any, devices: tuple[jax.Device, ...], robots: int) -> float:
+    """Measured in a compiled program, as the loop has it: calling C from it costs as much as several of its steps."""
+    mesh = jax.sharding.Mesh(np.array(devices), ("devices",))
+    model, together = robot.mj_model, min(robots, 64)
+    low, high = model.actuator_ctrlrange.T
+    controls = np.random.default_rng(0).uniform(low, high, (together, model.nu)).astype(np.float32)
+
+    def advance(qpos, qvel, warmstart, control):
+        after = robot._engine.advance(qpos, qvel, warmstart, control, robot.frame_skip, robot.reads)
+        return after.qpos, after.qvel, after.qacc_warmstart
+
+    def play(count):
+        still = (jnp.asarray(model.qpos0, jnp.float32), *(jnp.zeros(model.nv) for _ in range(2)))
+        start = tuple(jnp.broadcast_to(leaf, (together, *leaf.shape)) for leaf in still)
+        return jax.lax.fori_loop(0, count, lambda _, state: jax.vmap(advance)(*state, controls), start)[0][None]
+
+    program = jax.jit(jax.shard_map(play, mesh=mesh, in_specs=P(), out_specs=P("devices"), check_vma=False))
+    count, taken = _repeated(lambda count: program(jnp.int32(count)), 0.1)
+    return count * together / taken
+
+
+def _repeated(program: Callable[[int], Any], wanted: float) -> tuple[int, float]:
+    """(how often, seconds) of a program that repeats its work as often as its argument says, for some `wanted` seconds.
+
+    In short calls: on a busy machine one that was quick may take a thousand times as long the next time.
+    """
+
+    def seconds(count: int) -> float:
+        begun = time.perf_counter()
+        jax.block_until_ready(program(count))
+        return time.perf_counter() - begun
+
+    count, times, taken = 1, 0, 0.0
+    seconds(count)  # compiles
+    while seconds(count) < 0.1 * wanted and count < 1000:
+        count *= 4
+    while taken < wanted:
+        times, taken = times + count, taken + seconds(count)
+    return times, taken
+
+
+# ---- said ------------------------------------------------------------------------------------------------------------
+
+
+def expectation(training: Training, done: int = 0) -> str:
+    """How long the run is going to take after env step `done`, and how that is known, in a line."""
+    trainer, spec = training.trainer, training.spec
+    schedule = trainer.schedule
+    if training.processes.size > 1 or not trainer.on_cpu:
+        where = "several processes" if training.processes.size > 1 else "an accelerator"
+        return f"expected: not estimated for {where}; the first interval shows the rate and the time left"
+    group = max(spec.groups, key=lambda g: len(g.members) * _member(spec, schedule, g))
+    critic = (update.critic_input_size(spec, group), *group.algorithm.hidden, 1)
+    layer = max(pairwise(critic), key=lambda sizes: sizes[0] * sizes[1])
+    # Larger products are done at the same rate, and take longer to measure.
+    shape = (min(size, 1024) for size in (schedule.batch_size // trainer.devices_per_seed, *layer))
+    places = tuple(trainer.mesh.devices.flat)
+    products = product_rate(places, *shape)
+    physics = physics_rate(training.env, places, trainer.local_seeds * schedule.num_envs)
+    steps = training.total_steps - done
+    learning = training.total_steps - max(done, trainer.prefill_steps)
+    evaluations = training.evaluations_after(max(done, trainer.prefill_steps))
+    if not done and training.eval_every:
+        evaluations += 1  # of the untrained policies
+    evaluated = evaluations * training.config.eval_episodes * training.env.episode_length
+    updates = learning * schedule.updates_per_collect / schedule.collect_steps
+    flops = (steps + evaluated) * acting_flops(spec) + updates * update_flops(spec, schedule)
+    seconds = trainer.rows * flops / (REACHED * products)
+    how = f"products at {products / 1e9:.3g} GFLOP/s measured on these devices"
+    if physics is None:
+        how += "; the environment's own time is not counted"
+    else:
+        seconds += trainer.local_seeds * (steps + evaluated) / physics  # a device steps its own seeds
+        how += f", physics {_rounded(physics):,} env steps/s a core"
+    return f"expected: {duration(seconds)}, compiling apart ({how})"
+
+
+def duration(seconds: float) -> str:
+    """A length of time in words, as exact as an estimate can be."""
+    if seconds < 60:
+        return "under a minute"
+    if seconds < 3600:
+        minutes = round(seconds / 60)
+        return f"about {minutes} minute{'s' * (minutes > 1)}"
+    hours = seconds / 3600
+    return f"about {hours:.1f} hours" if hours < 10 else f"about {hours:,.0f} hours"
+
+
+def _rounded(number: float) -> int:
+    """To two digits."""
+    return int(float(f"{number:.2g}"))

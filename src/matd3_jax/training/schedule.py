@@ -1,0 +1,39 @@
+"""How play and learning alternate."""
+
+import dataclasses
+import math
+
+
+@dataclasses.dataclass(frozen=True)
+class Schedule:
+    """Static.
+
+    Collect `num_envs * rollout_length` env steps, then `updates_per_collect` updates; actors and targets move with
+    every policy_delay-th update. The unit that the scan repeats (a cycle) is the shortest stretch of whole collects
+    that holds every algorithm's delay a whole number of times, so that the delay is structure and not a condition.
+    """
+
+    num_envs: int = 4
+    rollout_length: int = 25
+    updates_per_collect: int = 1
+    batch_size: int = 1024
+    replay_capacity: int = 1_000_000
+    """Transitions a seed; a multiple of `collect_steps`."""
+    learning_starts: int = 25_600
+    """Transitions in the replay at the first update."""
+    warmup: str = "policy"
+    """Before that, "policy": the untrained policies act; "random": uniform actions."""
+    shared_minibatch: bool = False
+    """One minibatch (and one set of target actions) for all agents instead of one each."""
+    sequential: bool = False
+    """Update the agents one after another (see `update.update`)."""
+
+    @property
+    def collect_steps(self) -> int:
+        """Env steps of one collect."""
+        return self.num_envs * self.rollout_length
+
+    @property
+    def prefill_collects(self) -> int:
+        """Collects before the loop: the first collect of the loop then reaches `learning_starts`."""
+        return max(0, math.ceil(self.learning_starts / self.collect_steps) - 1)

@@ -1,0 +1,335 @@
+"""A run from its settings: what `matd3_jax.train` returns, and what the command advances chunk by chunk."""
+
+import contextlib
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import jax
+import numpy as np
+
+from matd3_jax import config as configuration
+from matd3_jax import envs
+from matd3_jax.config import Config
+from matd3_jax.core.agents import Spec
+from matd3_jax.core.algorithm import HyperParams
+from matd3_jax.core.rollout import Episodes, Evaluation
+from matd3_jax.envs.base import Environment
+from matd3_jax.envs.joint import JointTeam
+from matd3_jax.errors import UserError
+from matd3_jax.runs import overestimation
+from matd3_jax.runtime import devices
+from matd3_jax.runtime.multihost import ALONE, Processes
+from matd3_jax.training.clock import Clock
+from matd3_jax.training.loop import Metrics, Program, Trainer, TrainState
+from matd3_jax.training.schedule import Schedule
+
+Row = dict[str, np.ndarray]
+"""Columns of the metrics table for one chunk: each [seeds]; "step" and "seed" among them."""
+
+
+EVALUATION_SPACING = 4
+"""Env steps of training, at least, for each env step of an evaluation, by default. Evaluations cost no updates: they
+take some 3 % of a robot's training with the fast recipe, less with others."""
+
+
+@dataclasses.dataclass
+class Result:
+    """What `train` returns."""
+
+    config: Config
+    training: "Training"
+    state: TrainState
+    """Everything trained, leading axis [seeds] (see `loop.TrainState`)."""
+    metrics: dict[str, np.ndarray]
+    """Columns of the metrics table, each [seeds, chunks]; "step" is env steps of each seed."""
+
+    def evaluate(self, episodes: int = 100, deterministic: bool = True, seed: int = 0) -> np.ndarray:
+        """Undiscounted returns [seeds, episodes, agents] of whole episodes (see `Training.evaluate`)."""
+        return self.training.evaluate(self.state, episodes, deterministic, seed).episode_return
+
+
+class Training:
+    """Programs and plan of one run, or of several that share a program (a piece of a sweep).
+
+    Args:
+        config: checked settings.
+        env: the environment; default: the one that `config.env` names.
+        members: settings of the runs side by side, which may differ in `HyperParams`, `seed` and `seeds` only; default
+            `config` alone. Wherever an axis [seeds] is, the seeds of the first come first.
+        processes: which train them together, each its share of the seeds on its own devices. States have the seeds of
+            this process alone; rows of the metrics table those of all processes in the first of them.
+
+    Raises UserError where the environment does not take its options, a team has no agents, or a process no seed.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        env: Environment | None = None,
+        members: Sequence[Config] | None = None,
+        processes: Processes = ALONE,
+    ):
+        self.config, self.processes = config, processes
+        self.members = (config,) if members is None else tuple(members)
+        numbers = np.concatenate([np.arange(m.seed, m.seed + m.seeds) for m in self.members])
+        self.clock = Clock()
+        self.share = processes.share(len(numbers))
+        """Which of the seeds are trained in this process."""
+        self.seeds = numbers[self.share.seeds]
+        """[seeds] the number that each seed's key is made from."""
+        base = envs.make(**config.env) if env is None else env
+        teams = config.teams()
+        if config.adversary is not None and "adversaries" not in base.teams:
+            raise UserError(f"adversary={config.adversary.name}: {config.env['name']} has no adversaries")
+        joint = tuple(team for team in dict.fromkeys(base.teams) if teams[team].joint)
+        for team in joint:
+            base = JointTeam(base, (team,))
+        self.env = base
+        self.spec = Spec.of(self.env, {team: algo.algorithm() for team, algo in teams.items()}, config.n_step)
+        schedule = Schedule(
+            num_envs=config.num_envs,
+            rollout_length=config.rollout_length,
+            updates_per_collect=config.updates_per_collect,
+            batch_size=config.batch_size,
+            replay_capacity=config.replay_capacity,
+            learning_starts=config.learning_starts,
+            warmup=config.warmup,
+            shared_minibatch=config.shared_minibatch,
+            sequential=config.update_order == "sequential",
+        )
+        hyper = {team: self._hyper(team) for team in teams}
+        seeds, normalise = len(self.seeds), config.normalise_observations
+        local = jax.local_devices()
+        least = config.normalise_least_deviation
+        options: dict[str, Any] = {"normalise_observations": normalise, "least_deviation": least}
+        trainer = Trainer(self.env, self.spec, schedule, hyper, seeds, local, **options)
+        # Whole chunks of equal length, so that one compiled program does for all; as many as come closest to log_every.
+        cycles = max(1, math.ceil((config.total_steps - trainer.prefill_steps) / trainer.cycle_steps))
+        wanted = max(1, round((config.log_every or config.total_steps / 100) / trainer.cycle_steps))
+        self.num_chunks = math.ceil(cycles / wanted)
+        self.cycles_per_chunk = math.ceil(cycles / self.num_chunks)
+        self.total_steps = trainer.prefill_steps + self.num_chunks * self.cycles_per_chunk * trainer.cycle_steps
+        """Env steps of each seed: the first whole chunk at or after the wanted number."""
+        # Rows that would never be written are not allocated: the same result in less memory.
+        capacity = min(config.replay_capacity, self.total_steps)
+        schedule = dataclasses.replace(schedule, replay_capacity=capacity)
+        kept = config.diagnostics.q_bias_rollouts if config.diagnostics.q_bias else 0
+        self.trainer = Trainer(self.env, self.spec, schedule, hyper, seeds, local, q_bias_pairs=kept, **options)
+
+    def _hyper(self, team: str) -> HyperParams:
+        """The team's hyper-parameters, leaves [seeds]."""
+        each = [m.teams()[team].hyper_params() for m in self.members for _ in range(m.seeds)][self.share.seeds]
+        return jax.tree.map(lambda *leaves: np.array(leaves, np.float32), *each)
+
+    # ---- memory ------------------------------------------------------------------------------------------------------
+
+    @property
+    def memory(self) -> str:
+        """The arithmetic of the replay's memory."""
+        t, s = self.trainer, self.spec
+        copies = f"{t.devices_per_seed} copies x " if t.devices_per_seed > 1 else ""
+        whose = f" of process {self.processes.index}" if self.processes.size > 1 else ""
+        return (
+            f"replay{whose}: {t.rows} seeds x {copies}{t.schedule.replay_capacity:,} transitions x {s.row_size} "
+            f"numbers x 4 bytes = {t.replay_bytes / 1e9:.2f} GB (x {s.observation_size}, actions {s.action_size}, "
+            f"rewards {s.num_agents}, {'more 1, ' if s.n_step > 1 else ''}x' {s.observation_size}, discount 1)"
+        )
+
+    def check_memory(self) -> None:
+        """Raise UserError, with the arithmetic, if the replay cannot fit."""
+        free = devices.free_memory(self.processes.here)
+        if self.trainer.replay_bytes > free:
+            raise UserError(
+                f"{self.memory}, but only {free / 1e9:.2f} GB are free: fewer seeds, or replay_capacity at most "
+                f"{int(free * self.trainer.schedule.replay_capacity / self.trainer.replay_bytes):,}"
+            )
+
+    # ---- running -----------------------------------------------------------------------------------------------------
+
+    def keys(self) -> jax.Array:
+        """One key a seed; a seed's key does not depend on the seeds beside it."""
+        return jax.vmap(jax.random.key)(self.seeds)
+
+    def start(self) -> tuple[TrainState, Row]:
+        """The state after the prefill, and what the untrained policies got there (of all processes in the first)."""
+        self.check_memory()
+        state, episodes = self.trainer.prefill(self.trainer.init(self.keys()))
+        row = self.row(state, Metrics(episodes, None))  # type: ignore[arg-type]
+        state, columns = self._evaluated(state, due=True)
+        return state, self.processes.gather(row | columns)
+
+    @cached_property
+    def chunk(self) -> Program:
+        """The program of one chunk: compiled once."""
+        return self.trainer.chunk(self.cycles_per_chunk)
+
+    def advance(self, state: TrainState) -> tuple[TrainState, Row]:
+        """One chunk, and an evaluation where one is due; the row has the seeds of all processes in the first of them.
+        The state given in is donated."""
+        before = self.step(state)
+        with self.clock.train():
+            state, metrics = jax.block_until_ready(self.chunk(state))
+        row = self.row(state, metrics)
+        state, columns = self._evaluated(state, self._due(before, self.step(state)))
+        return state, self.processes.gather(row | columns)
+
+    def step(self, state: TrainState) -> int:
+        """Env steps of each seed so far."""
+        return self.trainer.env_steps(int(state.collects))
+
+    def row(self, state: TrainState, metrics: Metrics) -> Row:
+        """The chunk's row of the metrics table for each seed."""
+        seeds = len(self.seeds)
+        collects = int(state.collects)
+        row: Row = {
+            "step": np.full(seeds, self.trainer.env_steps(collects)),
+            "seed": self.seeds,
+            "updates": np.full(seeds, self.trainer.updates(collects)),
+        }
+        episodes = Episodes(*(np.asarray(e, np.float64)[:seeds].sum(axis=1) for e in metrics.episodes))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            returns = episodes.episode_return / episodes.count[:, None]
+            length = episodes.length / episodes.count
+        row["episodes"] = episodes.count.astype(int)
+        row["episode_length"] = length
+        for team in dict.fromkeys(self.spec.teams):
+            row[f"return_{team}"] = returns @ self.team_weights(team)
+        for i, agent in enumerate(self.spec.agents):
+            row[f"{agent}_return"] = returns[:, i]
+        losses = metrics.update._asdict() if metrics.update is not None else {}
+        for name in ("critic_loss", "q_value", "actor_loss"):
+            values = np.asarray(losses[name], np.float64)[:seeds].mean(axis=1) if losses else None
+            for i, agent in enumerate(self.spec.agents):
+                row[f"{agent}_{name}"] = np.full(seeds, np.nan) if values is None else values[:, i]
+        return row
+
+    def team_weights(self, team: str) -> np.ndarray:
+        """Weights [agents] of the agents' returns in the number reported for a team (`Environment.return_weights`)."""
+        member = np.array([t == team for t in self.spec.teams])
+        return np.where(member, self.env.return_weights, 0.0)
+
+    # ---- evaluation --------------------------------------------------------------------------------------------------
+
+    @property
+    def eval_every(self) -> int:
+        """Env steps between evaluations; 0: never."""
+        every = self.config.eval_every
+        if every is not None:
+            return every
+        played = self.config.eval_episodes * self.env.episode_length
+        return max(self.config.total_steps // 20, EVALUATION_SPACING * played)
+
+    def _due(self, before: int, step: int) -> bool:
+        """Whether an evaluation ends the chunk from env step `before` to `step`."""
+        every = self.eval_every
+        return every > 0 and (step // every > before // every or step >= self.total_steps)
+
+    def evaluations_after(self, step: int) -> int:
+        """How many evaluations are to come after the chunk that ended at env step `step`."""
+        chunk = self.cycles_per_chunk * self.trainer.cycle_steps
+        ends = range(step, self.total_steps + chunk, chunk)
+        return sum(map(self._due, ends[:-1], ends[1:]))
+
+    def evaluate(self, state: TrainState, episodes: int, deterministic: bool, seed: int = 0) -> Evaluation:
+        """Whole episodes in float64, leading axis [seeds]; every seed of the run plays from the same start states,
+        which `seed` gives."""
+        # Apart from the training's keys, which are split from key(seed).
+        key = jax.random.fold_in(jax.random.key(seed), 2**31 - 1)
+        keys = jax.vmap(lambda _: key)(self.seeds)
+        found = self.trainer.evaluate(state, keys, episodes, deterministic)
+        return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), found)
+
+    def _evaluated(self, state: TrainState, due: bool) -> tuple[TrainState, Row]:
+        """The state as `q_bias` leaves it, and all columns of evaluations: nan where none is due."""
+        jax.block_until_ready(state)  # what is still computed is no evaluation
+        with self.clock.evaluate() if due and self.eval_every else contextlib.nullcontext():
+            row = self.evaluation_columns(state if due else None)
+            state, columns = self.q_bias(state, due)
+        return state, row | columns
+
+    def evaluation_columns(self, state: TrainState | None) -> Row:
+        """What an evaluation adds to a row: means over `eval_episodes` deterministic episodes, from the same start
+        states every time; nan where `state` is None. No columns without evaluations."""
+        if not self.eval_every:
+            return {}
+        if state is None:
+            sizes = (self.spec.num_agents, 1, len(self.env.measures))
+            returns, length, measures = (np.full((len(self.seeds), size), np.nan) for size in sizes)
+        else:
+            found = self.evaluate(state, self.config.eval_episodes, deterministic=True)
+            returns, length, measures = (leaf.mean(axis=1).reshape(len(self.seeds), -1) for leaf in found)
+        columns = {f"eval_return_{team}": returns @ self.team_weights(team) for team in dict.fromkeys(self.spec.teams)}
+        columns["eval_episode_length"] = length[:, 0]
+        columns |= {f"eval_{name}": measures[:, k] for k, name in enumerate(self.env.measures)}
+        columns |= {f"{agent}_eval_return": returns[:, i] for i, agent in enumerate(self.spec.agents)}
+        return columns
+
+    def q_bias(self, state: TrainState, due: bool) -> tuple[TrainState, Row]:
+        """The state with its reservoir restarted, and what an evaluation says of the critics (see
+        `overestimation.columns`); the same state and nan where none is due, or nothing was collected since the last.
+        No columns with diagnostics.q_bias off."""
+        if state.reservoir is None:
+            return state, {}
+        found = None
+        if due and int(state.collects) > int(state.reservoir.since):
+            found = self.trainer.measure_q_bias(state, self.config.diagnostics.q_bias_steps)
+            state = self.trainer.restart_reservoir(state)
+        return state, overestimation.columns(self.spec.agents, found, len(self.seeds))
+
+
+def train(
+    *overrides: str,
+    env: str | Environment = "simple_spread",
+    algo: str = "matd3",
+    callback: Callable[[Row], None] | None = None,
+    **settings: Any,
+) -> Result:
+    """Train `seeds` runs side by side and return their states and metrics.
+
+    Takes what the command line takes: `train(env="simple_tag", algo="matd3", adversary="maddpg", seeds=8)`, and
+    single values as strings: `train("algo.lr=0.003", "env.num_good=2", ...)`. Writes no files.
+
+    Args:
+        env: a name, or an `Environment` of your own.
+        callback: called with every chunk's row (columns [seeds]) as it comes.
+
+    Raises UserError for settings that are unknown or impossible.
+    """
+    devices.prepare()
+    own = None if isinstance(env, str) else env
+    chosen = [f"algo={algo}", *(f"{key}={_text(value)}" for key, value in settings.items()), *overrides]
+    config = configuration.load(chosen if own is not None else [f"env={env}", *chosen])
+    if own is not None:
+        config = dataclasses.replace(config, env={"name": type(own).__name__})
+    training = Training(config, own)
+    state, row = training.start()
+    rows = [row]
+    for _ in range(training.num_chunks):
+        if callback is not None:
+            callback(row)
+        state, row = training.advance(state)
+        rows.append(row)
+    if callback is not None:
+        callback(row)
+    return Result(config, training, state, stack(rows))
+
+
+def stack(rows: list[Row]) -> dict[str, np.ndarray]:
+    """Columns [seeds, chunks] of rows with columns [seeds]."""
+    return {name: np.stack([row[name] for row in rows], axis=1) for name in rows[0]}
+
+
+def _text(value: Any) -> str:
+    """A value in Hydra's grammar."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{k}:{_text(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ",".join(map(_text, value)) + "]"
+    return str(value)
