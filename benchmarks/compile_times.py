@@ -26,8 +26,7 @@ from benchmarks import fresh
 from benchmarks.commit import commit
 from matd3_jax import config
 from matd3_jax.cli import command
-from matd3_jax.envs.base import nearest
-from matd3_jax.errors import UserError
+from matd3_jax.errors import UserError, nearest
 from matd3_jax.runtime import devices
 
 DEFAULTS: dict[str, Any] = {"envs": None, "repeats": 1, "at_once": 1, "out": None}

@@ -30,8 +30,7 @@ from benchmarks.peers_scripts.process import Process, WorkerError
 from benchmarks.peers_scripts.rows import WORKERS, Row, Variant
 from matd3_jax import config
 from matd3_jax.cli import command
-from matd3_jax.envs.base import nearest
-from matd3_jax.errors import UserError
+from matd3_jax.errors import UserError, nearest
 from matd3_jax.runtime import devices
 
 DEFAULTS: dict[str, Any] = {"prepare": False, "turns": 3, "seconds": 2.0, "only": None, "envs": None, "out": None}

@@ -28,8 +28,7 @@ from experiments.study import RESULTS, Stopped, Study
 from experiments.tidy import Table
 from matd3_jax import config
 from matd3_jax.cli import command
-from matd3_jax.envs.base import nearest
-from matd3_jax.errors import UserError
+from matd3_jax.errors import UserError, nearest
 
 STUDIES: dict[str, Study] = {
     module.STUDY.name: module.STUDY

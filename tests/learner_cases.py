@@ -14,7 +14,7 @@ from matd3_jax import config
 from matd3_jax.core import n_step, replay, update
 from matd3_jax.core.agents import Spec
 from matd3_jax.envs import Box, Simplex, make
-from matd3_jax.envs.joint import JointTeam
+from matd3_jax.envs.wrappers.joint_team import JointTeam
 
 BATCH = 7
 

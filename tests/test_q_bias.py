@@ -26,7 +26,7 @@ from matd3_jax.core.q_bias import Pairs, Values
 from matd3_jax.core.rollout import Policy
 from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.envs import make
-from matd3_jax.envs.point import PointState
+from matd3_jax.envs.point_reach import PointState
 from matd3_jax.errors import UserError
 from matd3_jax.figures import q_bias as q_bias_figure
 from matd3_jax.runs import overestimation

@@ -15,7 +15,7 @@ from PIL import Image, ImageSequence
 from matd3_jax import config
 from matd3_jax.cli import render, train
 from matd3_jax.envs import Box, Environment, TimeStep, make
-from matd3_jax.envs.joint import JointTeam
+from matd3_jax.envs.wrappers.joint_team import JointTeam
 from matd3_jax.errors import UserError
 from matd3_jax.evaluation import trajectory
 from matd3_jax.training import checkpoint

@@ -10,7 +10,7 @@ import pytest
 from matd3_jax.core.agents import Spec
 from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.envs import Box, Simplex, make
-from matd3_jax.envs.joint import JointTeam
+from matd3_jax.envs.wrappers.joint_team import JointTeam
 
 MATD3, MADDPG = Algorithm(), Algorithm(name="maddpg", num_critics=1, policy_delay=1)
 TASKS = (

@@ -1,6 +1,6 @@
 """Stepping alone of environments in JAX, ours and JaxMARL's in the same loop: random actions, one program with
 `jax.vmap` over environments in `jax.lax.scan`, every episode that ends started anew (JaxMARL's `step`, and ours under
-JaxMARL's calling convention, `matd3_jax.envs.jaxmarl`).
+JaxMARL's calling convention, `matd3_jax.interop.jaxmarl`).
 
 Case: {"suite": "ours" or "jaxmarl", "env": name, "options": {...}, "num_envs": n, "steps": of each environment in a
 stretch}.
@@ -50,7 +50,7 @@ def make(case: dict):
 
         return jaxmarl.make(case["env"], **case["options"])
     from matd3_jax import envs
-    from matd3_jax.envs.jaxmarl import JaxMARL
+    from matd3_jax.interop.jaxmarl import JaxMARL
     from matd3_jax.runtime import devices
 
     devices.prepare()  # with the settings of XLA that our commands run with

@@ -1,5 +1,19 @@
-"""The one exception for what a user can put right."""
+"""Errors that a user can put right, and what was probably meant."""
+
+import difflib
+from collections.abc import Iterable
 
 
 class UserError(ValueError):
     """A setting, file or directory that will not do; its message is one line that says why and what would."""
+
+
+class OptionError(ValueError):
+    """A name or an option that no environment takes; the message names the key, the value and what is allowed."""
+
+
+def nearest(word: object, known: Iterable[str]) -> str:
+    """The end of an error message: what was probably meant, or else everything that is known."""
+    known = sorted(known)
+    close = difflib.get_close_matches(str(word), known, n=3, cutoff=0.5)
+    return f"did you mean {' or '.join(repr(name) for name in close)}?" if close else f"known: {', '.join(known)}"

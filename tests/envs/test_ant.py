@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from matd3_jax.envs import OptionError, make
-from matd3_jax.envs.mjx.models import CONTACT_POINTS
+from matd3_jax.envs.robots.engines.models import CONTACT_POINTS
 
 pytestmark = pytest.mark.usefixtures("quick_jit")
 

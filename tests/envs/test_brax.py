@@ -12,13 +12,13 @@ import pytest
 
 from matd3_jax import config
 from matd3_jax.envs import Box, OptionError, make, names
-from matd3_jax.envs.joint import JointTeam
+from matd3_jax.envs.wrappers.joint_team import JointTeam
 
 pytest.importorskip("brax")
 
-from matd3_jax.envs import brax_models as models  # noqa: E402
-from matd3_jax.envs.brax import BraxState  # noqa: E402
-from matd3_jax.envs.quiet import quiet, quiet_mujoco  # noqa: E402
+from matd3_jax.envs.robots import brax_models as models
+from matd3_jax.envs.robots.brax import BraxState
+from matd3_jax.envs.robots.quiet import quiet, quiet_mujoco
 
 mujoco = pytest.importorskip("mujoco")
 

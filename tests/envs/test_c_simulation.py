@@ -17,8 +17,8 @@ import pytest
 from jax.sharding import Mesh, PartitionSpec
 
 from matd3_jax.envs import OptionError, make
-from matd3_jax.envs.mjx import c_simulation, engine, models
-from matd3_jax.envs.quiet import quiet_mujoco
+from matd3_jax.envs.robots.engines import c, engine, models
+from matd3_jax.envs.robots.quiet import quiet_mujoco
 
 pytestmark = pytest.mark.usefixtures("quick_jit")
 
@@ -234,7 +234,7 @@ def test_two_devices_are_one(name):
 
 SCRIPT = """
 import sys, numpy as np, jax
-from matd3_jax.envs.mjx import engine
+from matd3_jax.envs.robots.engines import engine
 simulation = engine.load("humanoid.xml", "c")
 inputs = [np.load(sys.argv[1])[k] for k in ("qpos", "qvel", "warmstart", "control")]
 step = jax.jit(jax.vmap(lambda *row: simulation.advance(*row, 5, ("xpos", "qfrc_actuator", "cfrc_ext"))))
@@ -281,7 +281,7 @@ def test_a_blow_up_ends_the_episode_without_reward_or_a_word(name, tmp_path, mon
     monkeypatch.chdir(tmp_path)
     env = make(name, physics="c", split="single")
     # As loaded first: a warning that has been given once is not given again.
-    fresh = c_simulation.load.__wrapped__(env.file)
+    fresh = c.load.__wrapped__(env.file)
     monkeypatch.setattr(type(env), "_engine", fresh)
     model, rng = env.mj_model, np.random.default_rng(0)
     qvel = rng.uniform(-1, 1, (BATCH, model.nv))
@@ -318,7 +318,7 @@ def test_mujoco_speaks_again_afterwards(tmp_path, monkeypatch):
 
 def test_auto_is_c_on_cpus_and_mjx_elsewhere(monkeypatch):
     assert make("ant").physics == make("ant", physics="auto").physics == "c"
-    assert isinstance(make("ant")._engine, c_simulation.CEngine)
+    assert isinstance(make("ant")._engine, c.CEngine)
     assert make("ant") == make("ant", physics="c")
     for backend in ("gpu", "tpu", "METAL"):
         monkeypatch.setattr(jax, "default_backend", lambda backend=backend: backend)

@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from matd3_jax.envs.mjx import contact_frame
-from matd3_jax.envs.mjx.quietly import collision_driver, mjx
+from matd3_jax.envs.robots.engines import contact_frame
+from matd3_jax.envs.robots.engines.quietly import collision_driver, mjx
 
 pytestmark = pytest.mark.usefixtures("quick_jit")
 

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from matd3_jax.envs import OptionError, make, plane, point_drawing
-from matd3_jax.envs.colours import BLUE, DARK_GREY, GREEN, GREY, PALE_GREEN, PURPLE, VERMILION, YELLOW
-from matd3_jax.envs.particle import drawing
-from matd3_jax.envs.point import PointState
+from matd3_jax.envs import OptionError, make
+from matd3_jax.envs.point_reach import PointState
+from matd3_jax.figures.palette import BLUE, DARK_GREY, GREEN, GREY, PALE_GREEN, PURPLE, VERMILION, YELLOW
+from matd3_jax.video import particle, plane, point_reach
 
 SIDE = 300
 TASKS = (
@@ -25,7 +25,7 @@ def still(env, frames=1, **changes):
 
 
 def draw(env, states):
-    return [np.asarray(image) for image in drawing.scene(env, states).images(SIDE)]
+    return [np.asarray(image) for image in particle.scene(env, states).images(SIDE)]
 
 
 def at(place, half=1.08, centre=(0.0, 0.0)):
@@ -105,7 +105,7 @@ def test_the_goal_is_green(name):
 
 
 def plane_of(env, states):
-    centre, half = drawing.scene(env, states).view()
+    centre, half = particle.scene(env, states).view()
     return half, centre
 
 
@@ -152,7 +152,7 @@ def test_a_long_message_is_no_wider_than_a_fifth_of_the_picture():
 def test_goals_bear_the_numbers_of_those_that_should_go_there(goal, labels):
     """In simple_reference goal[0] is agent 1's and goal[1] is agent 0's."""
     env = make("simple_reference")
-    discs = drawing.scene(env, still(env, goal=goal)).discs[:3]
+    discs = particle.scene(env, still(env, goal=goal)).discs[:3]
     assert [disc.label for disc in discs] == labels
     assert [disc.ringed for disc in discs] == [bool(label) for label in labels]
     assert [disc.colour for disc in discs] == [GREEN if label else GREY for label in labels]
@@ -211,7 +211,7 @@ def test_every_task_is_drawn_and_explained(name):
     images = draw(env, jax.tree.map(lambda *leaves: jnp.stack(leaves), *states))
     assert len(images) == 5
     assert all(np.any(a != b) for a, b in zip(images, images[1:], strict=False))
-    legend = drawing.legend(env)
+    legend = particle.legend(env)
     assert [what for what, _ in legend][: len(set(env.teams))]
     for what, colour in legend:
         assert close(images[-1], colour).any(), what
@@ -219,7 +219,7 @@ def test_every_task_is_drawn_and_explained(name):
 
 def point(env, pos, target):
     state = PointState(jnp.array([pos]), jnp.zeros((1, *np.shape(pos))), jnp.array([target]), jnp.zeros(1, jnp.int32))
-    return np.asarray(next(point_drawing.scene(env, state).images(SIDE)))
+    return np.asarray(next(point_reach.scene(env, state).images(SIDE)))
 
 
 def test_point_masses_on_a_plane():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from matd3_jax.envs import Box, Discrete, make
-from matd3_jax.envs.jaxmarl import JaxMARL
+from matd3_jax.interop.jaxmarl import JaxMARL
 
 
 def test_names_and_spaces():

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from matd3_jax.envs import Box, Discrete, MultiDiscrete, OptionError, Simplex, make
-from matd3_jax.envs.joint import JointTeam, join_spaces
-from matd3_jax.envs.point import PointReach
+from matd3_jax.envs.point_reach import PointReach
+from matd3_jax.envs.wrappers.joint_team import JointTeam, join_spaces
 
 
 def sample(env, key):

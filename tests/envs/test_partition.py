@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from matd3_jax.envs import OptionError
-from matd3_jax.envs.mjx.graphs import GRAPHS
-from matd3_jax.envs.mjx.partition import default_split, describe, lay_out, partition
+from matd3_jax.envs.robots.partition.graphs import GRAPHS
+from matd3_jax.envs.robots.partition.partition import default_split, describe, lay_out, partition
 
 mujoco = pytest.importorskip("mujoco")
 gymnasium = pytest.importorskip("gymnasium")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from matd3_jax.envs import make
-from matd3_jax.envs.quiet import quiet_mujoco
+from matd3_jax.envs.robots.quiet import quiet_mujoco
 
 pytestmark = [
     pytest.mark.usefixtures("quick_jit"),

@@ -3,8 +3,7 @@
 import sys
 from collections.abc import Callable, Sequence
 
-from matd3_jax.envs.base import OptionError
-from matd3_jax.errors import UserError
+from matd3_jax.errors import OptionError, UserError
 
 
 def code(main: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:

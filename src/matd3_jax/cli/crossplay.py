@@ -15,8 +15,8 @@ from rich.table import Table
 
 from matd3_jax import config, envs
 from matd3_jax.config import Config
-from matd3_jax.envs.base import Environment, nearest
-from matd3_jax.errors import UserError
+from matd3_jax.envs.environment import Environment
+from matd3_jax.errors import UserError, nearest
 from matd3_jax.evaluation import cross_play
 from matd3_jax.evaluation.cross_play import TEAMS, Team
 from matd3_jax.evaluation.cross_play_table import Mean, Pairings, pairs_of

@@ -11,8 +11,7 @@ from rich.table import Table
 
 from matd3_jax import config
 from matd3_jax.core.rollout import Evaluation
-from matd3_jax.envs.base import nearest
-from matd3_jax.errors import UserError
+from matd3_jax.errors import UserError, nearest
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import devices
 from matd3_jax.stats.intervals import mean_interval

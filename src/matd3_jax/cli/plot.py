@@ -8,8 +8,7 @@ import numpy as np
 
 from matd3_jax import config
 from matd3_jax.config import diff
-from matd3_jax.envs.base import nearest
-from matd3_jax.errors import UserError
+from matd3_jax.errors import UserError, nearest
 from matd3_jax.figures import learning_curves
 from matd3_jax.figures.learning_curves import Line, Panel
 from matd3_jax.runs import curves, directory

@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from matd3_jax import config
-from matd3_jax.envs.base import nearest
-from matd3_jax.errors import UserError
+from matd3_jax.errors import UserError, nearest
 from matd3_jax.evaluation import trajectory
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import devices

@@ -18,8 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from matd3_jax.config.coerce import plain, typed
 from matd3_jax.config.validate import check
 from matd3_jax.core.algorithm import Algorithm, HyperParams
-from matd3_jax.envs.base import OptionError, nearest
-from matd3_jax.errors import UserError
+from matd3_jax.errors import OptionError, UserError, nearest
 from matd3_jax.runtime import slurm
 
 ADDED_TO_ALGO = {"actor_output": "sigmoid", "actor_average": 0.0, "reward_scale": 1.0}
@@ -276,7 +275,7 @@ def read(path: Path) -> Config:
         assert isinstance(found, dict)
         values = _with_defaults(found, ADDED_LATER)
         if "physics" in values["env"]:
-            from matd3_jax.envs.mjx.engine import RENAMED  # MuJoCo, which particle tasks do not need
+            from matd3_jax.envs.robots.engines.engine import RENAMED
 
             physics = values["env"]["physics"]
             values["env"] = {**values["env"], "physics": RENAMED.get(physics, physics)}
@@ -318,7 +317,7 @@ def _with_engine(env: Mapping[str, Any]) -> Mapping[str, Any]:
     resumed."""
     if "physics" not in env:
         return env
-    from matd3_jax.envs.mjx import engine  # MuJoCo, which particle tasks do not need
+    from matd3_jax.envs.robots.engines import engine
 
     try:
         return {**env, "physics": engine.resolve(env["physics"])}

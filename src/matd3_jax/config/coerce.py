@@ -4,8 +4,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any
 
-from matd3_jax.envs.base import nearest
-from matd3_jax.errors import UserError
+from matd3_jax.errors import UserError, nearest
 
 
 def typed(cls: Any, values: Mapping[str, Any], prefix: str) -> Any:

@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from matd3_jax.core.algorithm import Algorithm
-from matd3_jax.envs.base import ActionSpace, Environment
+from matd3_jax.envs.environment import Environment
+from matd3_jax.envs.spaces import ActionSpace
 
 
 @dataclasses.dataclass(frozen=True)

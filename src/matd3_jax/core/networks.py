@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
-from matd3_jax.envs.base import ActionSpace, Box, Discrete, Simplex
+from matd3_jax.envs.spaces import ActionSpace, Box, Discrete, Simplex
 
 
 class StackedMLP(nn.Module):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from matd3_jax.core import networks, rollout, running_statistics, update
 from matd3_jax.core.agents import Spec
 from matd3_jax.core.rollout import Policy
-from matd3_jax.envs.base import Environment
+from matd3_jax.envs.environment import Environment
 
 
 class Pairs(NamedTuple):

@@ -12,7 +12,7 @@ from matd3_jax.core import networks, running_statistics, update
 from matd3_jax.core.agents import Spec
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.running_statistics import Statistics
-from matd3_jax.envs.base import Environment
+from matd3_jax.envs.environment import Environment
 
 APART = 2**31 - 1
 """Folded into a key whose `split` and other `fold_in` never get that far."""

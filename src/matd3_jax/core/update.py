@@ -16,7 +16,7 @@ from jax.flatten_util import ravel_pytree
 from matd3_jax.core import networks, optimizer
 from matd3_jax.core.agents import Group, Spec
 from matd3_jax.core.algorithm import HyperParams
-from matd3_jax.envs.base import ActionSpace
+from matd3_jax.envs.spaces import ActionSpace
 
 UNROLLED_MEMBERS = 4
 """Members of a group that a program holds one after another, instead of in a loop; more take longer to compile."""

@@ -1,4 +1,4 @@
-"""Environments in pure JAX under one contract (`base.Environment`); made by name with `make`.
+"""Environments in pure JAX under one contract (`environment.Environment`); made by name with `make`.
 
 Importing this package loads no environment: each is imported when it is first asked for.
 """
@@ -7,17 +7,9 @@ import dataclasses
 import importlib
 from typing import Any
 
-from .base import (
-    ActionSpace,
-    Box,
-    Discrete,
-    Environment,
-    MultiDiscrete,
-    OptionError,
-    Simplex,
-    TimeStep,
-    nearest,
-)
+from matd3_jax.envs.environment import Environment, TimeStep
+from matd3_jax.envs.spaces import ActionSpace, Box, Discrete, MultiDiscrete, Simplex
+from matd3_jax.errors import OptionError, nearest
 
 __all__ = [
     "ActionSpace",
@@ -43,19 +35,19 @@ _CLASSES = {
     "simple": (".particle.simple", "Simple"),
     "simple_reference": (".particle.simple_reference", "SimpleReference"),
     "simple_world_comm": (".particle.simple_world_comm", "SimpleWorldComm"),
-    "point_reach": (".point", "PointReach"),
-    "ant": (".mjx.ant", "Ant"),
-    "half_cheetah": (".mjx.planar", "HalfCheetah"),
-    "hopper": (".mjx.planar", "Hopper"),
-    "walker2d": (".mjx.planar", "Walker2d"),
-    "humanoid": (".mjx.humanoid", "Humanoid"),
-    "swimmer": (".mjx.planar", "Swimmer"),
-    "brax_ant": (".brax", "BraxAnt"),
-    "brax_half_cheetah": (".brax", "BraxHalfCheetah"),
-    "brax_hopper": (".brax", "BraxHopper"),
-    "brax_walker2d": (".brax", "BraxWalker2d"),
-    "brax_humanoid": (".brax", "BraxHumanoid"),
-    "brax_swimmer": (".brax", "BraxSwimmer"),
+    "point_reach": (".point_reach", "PointReach"),
+    "ant": (".robots.ant", "Ant"),
+    "half_cheetah": (".robots.planar", "HalfCheetah"),
+    "hopper": (".robots.planar", "Hopper"),
+    "walker2d": (".robots.planar", "Walker2d"),
+    "humanoid": (".robots.humanoid", "Humanoid"),
+    "swimmer": (".robots.planar", "Swimmer"),
+    "brax_ant": (".robots.brax", "BraxAnt"),
+    "brax_half_cheetah": (".robots.brax", "BraxHalfCheetah"),
+    "brax_hopper": (".robots.brax", "BraxHopper"),
+    "brax_walker2d": (".robots.brax", "BraxWalker2d"),
+    "brax_humanoid": (".robots.brax", "BraxHumanoid"),
+    "brax_swimmer": (".robots.brax", "BraxSwimmer"),
 }
 
 

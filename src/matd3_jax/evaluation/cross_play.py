@@ -17,8 +17,8 @@ from matd3_jax.core.agents import Spec
 from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.core.rollout import Policy
 from matd3_jax.core.running_statistics import Statistics
-from matd3_jax.envs.base import Environment
-from matd3_jax.envs.joint import JointTeam
+from matd3_jax.envs.environment import Environment
+from matd3_jax.envs.wrappers.joint_team import JointTeam
 from matd3_jax.training.loop import TrainState
 from matd3_jax.training.session import Training
 

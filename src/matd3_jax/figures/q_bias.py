@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from matd3_jax.envs.colours import AGENT, BLACK, Colour
 from matd3_jax.figures.learning_curves import curve
+from matd3_jax.figures.palette import AGENT, BLACK, Colour
 from matd3_jax.runs.metrics import by_seed
 from matd3_jax.runs.overestimation import team_values
 

@@ -9,8 +9,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from matd3_jax.envs.base import nearest
-from matd3_jax.errors import UserError
+from matd3_jax.errors import UserError, nearest
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.stats.intervals import mean_interval
 

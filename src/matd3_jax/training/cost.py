@@ -14,7 +14,7 @@ from jax.sharding import PartitionSpec as P
 
 from matd3_jax.core import update
 from matd3_jax.core.agents import Group, Spec
-from matd3_jax.envs.base import Environment
+from matd3_jax.envs.environment import Environment
 from matd3_jax.training.schedule import Schedule
 from matd3_jax.training.session import Training
 

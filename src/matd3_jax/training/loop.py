@@ -19,7 +19,7 @@ from matd3_jax.core.q_bias import Pairs, Reservoir, Values
 from matd3_jax.core.rollout import EnvState, Episodes, Evaluation, Policy
 from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.core.update import GroupState, UpdateMetrics
-from matd3_jax.envs.base import Environment
+from matd3_jax.envs.environment import Environment
 from matd3_jax.training.schedule import Schedule
 
 

@@ -16,8 +16,8 @@ from matd3_jax.config import Config
 from matd3_jax.core.agents import Spec
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.rollout import Episodes, Evaluation
-from matd3_jax.envs.base import Environment
-from matd3_jax.envs.joint import JointTeam
+from matd3_jax.envs.environment import Environment
+from matd3_jax.envs.wrappers.joint_team import JointTeam
 from matd3_jax.errors import UserError
 from matd3_jax.runs import overestimation
 from matd3_jax.runtime import devices

@@ -7,13 +7,13 @@ import jax
 from PIL import Image, ImageDraw
 from PIL.ImageFont import FreeTypeFont
 
-from matd3_jax.envs import plane
-from matd3_jax.envs.base import Environment
-from matd3_jax.envs.colours import BLACK, WHITE, Colour
-from matd3_jax.envs.joint import JointTeam
+from matd3_jax.envs.environment import Environment
 from matd3_jax.envs.particle.task import ParticleTask
-from matd3_jax.envs.point import PointReach
+from matd3_jax.envs.point_reach import PointReach
+from matd3_jax.envs.wrappers.joint_team import JointTeam
 from matd3_jax.errors import UserError
+from matd3_jax.figures.palette import BLACK, WHITE, Colour
+from matd3_jax.video import plane
 from matd3_jax.video.mujoco_renderer import RobotDrawing
 from matd3_jax.video.scene2d import Drawing, OwnDrawing, SceneDrawing
 

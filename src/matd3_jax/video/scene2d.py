@@ -8,12 +8,12 @@ import jax
 import numpy as np
 from PIL import Image
 
-from matd3_jax.envs import point_drawing
-from matd3_jax.envs.colours import Colour
-from matd3_jax.envs.particle import drawing as particle_drawing
 from matd3_jax.envs.particle.task import ParticleTask
-from matd3_jax.envs.point import PointReach
+from matd3_jax.envs.point_reach import PointReach
 from matd3_jax.errors import UserError
+from matd3_jax.figures.palette import Colour
+from matd3_jax.video import particle as particle_drawing
+from matd3_jax.video import point_reach
 
 
 class Drawing(abc.ABC):
@@ -40,12 +40,12 @@ class SceneDrawing(Drawing):
 
     def __init__(self, env: ParticleTask | PointReach):
         self.env = env
-        self.legend = point_drawing.LEGEND if isinstance(env, PointReach) else particle_drawing.legend(env)
+        self.legend = point_reach.LEGEND if isinstance(env, PointReach) else particle_drawing.legend(env)
 
     def images(self, selected: Any, width: int, height: int) -> Iterator[Image.Image]:
         env = self.env
         if isinstance(env, PointReach):
-            return point_drawing.scene(env, selected).images(min(width, height))
+            return point_reach.scene(env, selected).images(min(width, height))
         return particle_drawing.scene(env, selected).images(min(width, height))
 
 

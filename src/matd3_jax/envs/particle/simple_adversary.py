@@ -5,9 +5,9 @@ import dataclasses
 import chex
 import jax.numpy as jnp
 
-from ..base import check_count
-from .task import ParticleTask
-from .world import State, World, choose, distance_of, others, relative
+from matd3_jax.envs.environment import check_count
+from matd3_jax.envs.particle.task import ParticleTask
+from matd3_jax.envs.particle.world import State, World, choose, distance_of, others, relative
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -5,8 +5,8 @@ import dataclasses
 import chex
 import jax.numpy as jnp
 
-from .task import ParticleTask
-from .world import State, World, choose, distance_of, one_hot
+from matd3_jax.envs.particle.task import ParticleTask
+from matd3_jax.envs.particle.world import State, World, choose, distance_of, one_hot
 
 ADVERSARY, GOOD = 0, 1
 NUM_LANDMARKS = 2

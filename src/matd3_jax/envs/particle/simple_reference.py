@@ -5,8 +5,8 @@ import dataclasses
 import chex
 import jax.numpy as jnp
 
-from .task import ParticleTask, check_local_ratio
-from .world import State, World, choose, distance_of, one_hot, relative
+from matd3_jax.envs.particle.task import ParticleTask, check_local_ratio
+from matd3_jax.envs.particle.world import State, World, choose, distance_of, one_hot, relative
 
 NUM_LANDMARKS = 3
 

@@ -5,9 +5,9 @@ import dataclasses
 import chex
 import jax.numpy as jnp
 
-from ..base import check_count
-from .task import ParticleTask, check_local_ratio
-from .world import State, World, distance_of, others, relative
+from matd3_jax.envs.environment import check_count
+from matd3_jax.envs.particle.task import ParticleTask, check_local_ratio
+from matd3_jax.envs.particle.world import State, World, distance_of, others, relative
 
 AGENT_RADIUS = 0.15
 SILENT_DIM_C = 2

@@ -5,9 +5,9 @@ import dataclasses
 import chex
 import jax.numpy as jnp
 
-from ..base import check_count
-from .task import ParticleTask
-from .world import State, World, distance_of, others, outside, relative
+from matd3_jax.envs.environment import check_count
+from matd3_jax.envs.particle.task import ParticleTask
+from matd3_jax.envs.particle.world import State, World, distance_of, others, outside, relative
 
 PREDATOR_RADIUS, PREY_RADIUS, OBSTACLE_RADIUS = 0.075, 0.05, 0.2
 CAPTURE = 10.0

@@ -5,9 +5,9 @@ import dataclasses
 import chex
 import jax.numpy as jnp
 
-from ..base import check_count
-from .task import ParticleTask
-from .world import State, World, distance_of, others, outside, relative
+from matd3_jax.envs.environment import check_count
+from matd3_jax.envs.particle.task import ParticleTask
+from matd3_jax.envs.particle.world import State, World, distance_of, others, outside, relative
 
 LEADER = 0
 PREDATOR_RADIUS, PREY_RADIUS = 0.075, 0.045

@@ -8,19 +8,10 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from ..base import (
-    ActionSpace,
-    Box,
-    Discrete,
-    Environment,
-    MultiDiscrete,
-    OptionError,
-    Simplex,
-    TimeStep,
-    check_choice,
-    check_count,
-)
-from .world import State, World, one_hot
+from matd3_jax.envs.environment import Environment, TimeStep, check_choice, check_count
+from matd3_jax.envs.particle.world import State, World, one_hot
+from matd3_jax.envs.spaces import ActionSpace, Box, Discrete, MultiDiscrete, Simplex
+from matd3_jax.errors import OptionError
 
 NUM_MOVES = 5
 """Nothing, and a push along each direction of the plane."""

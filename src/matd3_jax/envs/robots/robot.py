@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from ..base import LIMIT, Box, Environment, TimeStep, check_count
-from . import engine
-from .engine import Engine, Physical
-from .partition import Layout, Partition, Split, as_split, describe, partition
+from matd3_jax.envs.environment import LIMIT, Environment, TimeStep, check_count
+from matd3_jax.envs.robots.engines import engine
+from matd3_jax.envs.robots.engines.engine import Engine, Physical
+from matd3_jax.envs.robots.partition.partition import Layout, Partition, Split, as_split, describe, partition
+from matd3_jax.envs.spaces import Box
 
 TERMS = ("forward", "survive", "ctrl", "contact")
 """Parts of the rewards."""

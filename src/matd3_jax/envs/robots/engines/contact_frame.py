@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, MutableMapping
 import jax.numpy as jnp
 import mujoco
 
-from .quietly import collision_driver, collision_primitive
+from matd3_jax.envs.robots.engines.quietly import collision_driver, collision_primitive
 
 PLANE_CAPSULE = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_CAPSULE)
 

@@ -4,10 +4,10 @@ from collections import Counter
 
 import numpy as np
 
-from ..colours import DARK_GREY, GREEN, GREY, PALE_GREEN, PURPLE, TEAM, YELLOW, Colour
-from ..plane import Disc, Scene
-from .task import ParticleTask
-from .world import State
+from matd3_jax.envs.particle.task import ParticleTask
+from matd3_jax.envs.particle.world import State
+from matd3_jax.figures.palette import DARK_GREY, GREEN, GREY, PALE_GREEN, PURPLE, TEAM, YELLOW, Colour
+from matd3_jax.video.plane import Disc, Scene
 
 LANDMARK: dict[str, Colour] = {
     "landmark": GREY,

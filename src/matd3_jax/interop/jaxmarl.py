@@ -7,7 +7,8 @@ from typing import Any
 import chex
 import jax
 
-from .base import ActionSpace, Box, Environment
+from matd3_jax.envs.environment import Environment
+from matd3_jax.envs.spaces import ActionSpace, Box
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,7 +6,9 @@ from typing import Any
 import chex
 import jax.numpy as jnp
 
-from .base import ActionSpace, Box, Discrete, Environment, MultiDiscrete, OptionError, Simplex, TimeStep, nearest
+from matd3_jax.envs.environment import Environment, TimeStep
+from matd3_jax.envs.spaces import ActionSpace, Box, Discrete, MultiDiscrete, Simplex
+from matd3_jax.errors import OptionError, nearest
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from ..base import LIMIT
-from ..quiet import quiet_mujoco
-from .engine import Physical
-from .models import corrected
+from matd3_jax.envs.environment import LIMIT
+from matd3_jax.envs.robots.engines.engine import Physical
+from matd3_jax.envs.robots.engines.models import corrected
+from matd3_jax.envs.robots.quiet import quiet_mujoco
 
 STATE = int(mujoco.mjtState.mjSTATE_QPOS | mujoco.mjtState.mjSTATE_QVEL | mujoco.mjtState.mjSTATE_WARMSTART)
 CONTROL = int(mujoco.mjtState.mjSTATE_CTRL)

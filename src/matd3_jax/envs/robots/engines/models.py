@@ -6,8 +6,8 @@ from typing import Any
 
 import mujoco
 
-from ..base import OptionError
-from ..quiet import quiet, quiet_mujoco
+from matd3_jax.envs.robots.quiet import quiet, quiet_mujoco
+from matd3_jax.errors import OptionError
 
 CONTACT_POINTS = 8
 """Contacts that MJX keeps of each kind, the deepest first. Robots touch the floor in fewer points at a time, so nothing

@@ -11,8 +11,8 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from .partition import Layout, Split, lay_out
-from .robot import Robot, RobotState, uniform
+from matd3_jax.envs.robots.partition.partition import Layout, Split, lay_out
+from matd3_jax.envs.robots.robot import Robot, RobotState, uniform
 
 
 class Planar(Robot):

@@ -12,9 +12,9 @@ from unittest import mock
 import jax
 import jax.numpy as jnp
 
-from .base import OptionError
-from .mjx.partition import KinematicTree, Layout, describe, lay_out
-from .quiet import quiet, quiet_mujoco
+from matd3_jax.envs.robots.partition.partition import KinematicTree, Layout, describe, lay_out
+from matd3_jax.envs.robots.quiet import quiet, quiet_mujoco
+from matd3_jax.errors import OptionError
 
 BACKENDS = ("spring", "positional", "generalized")
 

@@ -6,9 +6,9 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from .engine import Physical
-from .partition import Layout, Split, lay_out
-from .robot import Robot, uniform
+from matd3_jax.envs.robots.engines.engine import Physical
+from matd3_jax.envs.robots.partition.partition import Layout, Split, lay_out
+from matd3_jax.envs.robots.robot import Robot, uniform
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from .quietly import forward, mjx
+from matd3_jax.envs.robots.engines.quietly import forward, mjx
 
 
 def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:

@@ -7,7 +7,7 @@ import chex
 import jax
 import mujoco
 
-from ..base import OptionError, nearest
+from matd3_jax.errors import OptionError, nearest
 
 ENGINES = ("c", "mjx", "mjx_fast")
 """What `physics` may be once "auto" is resolved."""
@@ -77,9 +77,9 @@ def load(file: str, physics: str) -> Engine:
     Importing MJX takes seconds, so it is imported where it is used.
     """
     if physics == "c":
-        from . import c_simulation
+        from matd3_jax.envs.robots.engines import c
 
-        return c_simulation.load(file)
-    from . import simulation
+        return c.load(file)
+    from matd3_jax.envs.robots.engines import mjx
 
-    return simulation.load(file, physics)
+    return mjx.load(file, physics)

@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import brax_models as models
-from .base import LIMIT, Box, Environment, TimeStep, check_choice, check_count
-from .mjx.partition import Partition, Split, as_split, partition
+from matd3_jax.envs.environment import LIMIT, Environment, TimeStep, check_choice, check_count
+from matd3_jax.envs.robots import brax_models as models
+from matd3_jax.envs.robots.partition.partition import Partition, Split, as_split, partition
+from matd3_jax.envs.spaces import Box
 
 
 class BraxState(NamedTuple):
@@ -33,7 +34,7 @@ class BraxRobot(Environment):
 
     Not gymnasium's physics, and neither its returns. `backend` says how brax simulates: `spring` (maximal coordinates
     held together by springs; quickest), `positional` (position-based dynamics), `generalized` (articulated dynamics).
-    `split` says who moves which joints and `depth` what is seen of them: see `mjx.partition.partition`. An action is
+    `split` says who moves which joints and `depth` what is seen of them: see `partition.partition.partition`. An action is
     in [-1, 1] for each joint (brax scales the humanoid's to its motors).
 
     The full observation is brax's: generalised positions without those along the floor, and velocities (m, rad, m/s,

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from .colours import BLACK, GREEN, PURPLE, WHITE, Colour
+from matd3_jax.figures.palette import BLACK, GREEN, PURPLE, WHITE, Colour
 
 OVERSAMPLING = 3
 """Drawn so many times larger and then shrunk: smooth edges."""

@@ -7,11 +7,11 @@ import chex
 import jax
 import mujoco
 
-from . import runge_kutta
-from .contact_frame import as_in_c
-from .engine import Physical
-from .models import corrected
-from .quietly import mjx
+from matd3_jax.envs.robots.engines import runge_kutta
+from matd3_jax.envs.robots.engines.contact_frame import as_in_c
+from matd3_jax.envs.robots.engines.engine import Physical
+from matd3_jax.envs.robots.engines.models import corrected
+from matd3_jax.envs.robots.engines.quietly import mjx
 
 NEWTON = {"mjx": (8, 8), "mjx_fast": (1, 4)}
 """Iterations of the Newton solver and of its line search. In float32, 8 and 8 give what MuJoCo's default of 100 and 50

@@ -7,7 +7,8 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from .base import Box, Environment, TimeStep, check_count
+from matd3_jax.envs.environment import Environment, TimeStep, check_count
+from matd3_jax.envs.spaces import Box
 
 TIME_STEP = 0.1
 DAMPING = 0.25

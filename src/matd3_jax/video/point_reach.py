@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from .base import OptionError
-from .colours import BLUE, GREEN, Colour
-from .plane import Disc, Scene
-from .point import PointReach, PointState
+from matd3_jax.envs.point_reach import PointReach, PointState
+from matd3_jax.errors import OptionError
+from matd3_jax.figures.palette import BLUE, GREEN, Colour
+from matd3_jax.video.plane import Disc, Scene
 
 RADIUS, TARGET_RADIUS = 0.06, 0.05
 """Points have no size; their drawings have."""

@@ -4,10 +4,11 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-from ..base import OptionError, check_count, nearest
-from .graphs import GRAPHS, Graph
-from .kinematic_tree import Joint, KinematicTree, describe, own_bodies
-from .layout import Layout, lay_out
+from matd3_jax.envs.environment import check_count
+from matd3_jax.envs.robots.partition.graphs import GRAPHS, Graph
+from matd3_jax.envs.robots.partition.kinematic_tree import Joint, KinematicTree, describe, own_bodies
+from matd3_jax.envs.robots.partition.layout import Layout, lay_out
+from matd3_jax.errors import OptionError, nearest
 
 __all__ = [
     "KinematicTree",

@@ -1,6 +1,6 @@
 """MJX, imported without its printed remarks about optional packages that are not there."""
 
-from ..quiet import quiet
+from matd3_jax.envs.robots.quiet import quiet
 
 with quiet():
     from mujoco import mjx

@@ -1,1 +1,0 @@
-"""Robots simulated with MuJoCo MJX, and how their joints are shared out among agents."""

@@ -1,0 +1,1 @@
+"""Robots whose joints are shared out among agents."""

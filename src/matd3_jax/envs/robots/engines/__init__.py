@@ -1,0 +1,1 @@
+"""What steps a robot: C MuJoCo on the host, or MJX in the compiled program."""

@@ -1,0 +1,1 @@
+"""Who owns which joints and sees what: shared by all engines."""
