@@ -8,7 +8,6 @@ import warnings
 from typing import NamedTuple
 
 import numpy as np
-import scipy.stats
 from scipy.special import stdtrit
 
 
@@ -83,6 +82,8 @@ def compare(a: np.ndarray, b: np.ndarray, paired: bool = False, confidence: floa
     if min(len(a), len(b)) == 1:
         nothing = np.full_like(difference, np.nan)
         return Comparison(difference, nothing, nothing, nothing, len(a), len(b))
+    import scipy.stats  # slow to import, and only tests need it
+
     with warnings.catch_warnings(), np.errstate(all="ignore"):  # no variance: put right below
         warnings.simplefilter("ignore", RuntimeWarning)
         test = scipy.stats.ttest_rel(a, b) if paired else scipy.stats.ttest_ind(a, b, equal_var=False)

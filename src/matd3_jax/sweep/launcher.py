@@ -5,6 +5,7 @@
 """
 
 import dataclasses
+import runpy
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -61,10 +62,13 @@ def launch(folder: Path, pieces: int, launcher: str, options: Sequence[str]) -> 
 
 @hydra.main(version_base=None, config_path=None, config_name="matd3_jax_job")
 def job(config: Job) -> int:
-    """Train one piece."""
-    from matd3_jax.cli import command, sweep
-
-    return command.code(sweep.main, [f"resume='{config.sweep}'", f"piece={config.piece}"])
+    """Train one piece: `python -m matd3_jax.sweep` in this process."""
+    sys.argv = ["matd3_jax.sweep", f"resume='{config.sweep}'", f"piece={config.piece}"]
+    try:
+        runpy.run_module("matd3_jax.sweep", run_name="__main__", alter_sys=True)
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
 
 
 if __name__ == "__main__":

@@ -34,8 +34,8 @@ class BraxRobot(Environment):
 
     Not gymnasium's physics, and neither its returns. `backend` says how brax simulates: `spring` (maximal coordinates
     held together by springs; quickest), `positional` (position-based dynamics), `generalized` (articulated dynamics).
-    `split` says who moves which joints and `depth` what is seen of them: see `partition.partition.partition`. An action is
-    in [-1, 1] for each joint (brax scales the humanoid's to its motors).
+    `split` says who moves which joints and `depth` what is seen of them: see `partition.partition`. An action is in
+    [-1, 1] for each joint (brax scales the humanoid's to its motors).
 
     The full observation is brax's: generalised positions without those along the floor, and velocities (m, rad, m/s,
     rad/s; hopper's and walker2d's velocities clipped to [-10, 10]). The humanoid's goes on with inertia [10] and
