@@ -100,7 +100,7 @@ def products(trainer: Trainer, part: str = "loop") -> dict[Product, float]:
 
 
 def _update(trainer: Trainer, group: Group) -> Iterator[tuple[Product, float]]:
-    """(product, how many an update) of one agent of the group: see `update._update_agent`."""
+    """(product, how many an update) of one agent of the group: see `core.losses`."""
     spec, algorithm = trainer.spec, group.algorithm
     batch = trainer.schedule.batch_size // trainer.devices_per_seed
     hidden, delay = algorithm.hidden, algorithm.policy_delay

@@ -28,7 +28,7 @@ from benchmarks import limits
 from benchmarks.commit import commit
 from matd3_jax import config
 from matd3_jax.cli import command
-from matd3_jax.core import networks, replay
+from matd3_jax.core import replay
 from matd3_jax.errors import UserError
 from matd3_jax.runtime import devices
 from matd3_jax.training.loop import Trainer, TrainState
@@ -171,11 +171,11 @@ def _collects(trainer: Trainer, state: TrainState, hyper: Any) -> tuple[TrainSta
 
 def _env_steps(trainer: Trainer, state: TrainState) -> tuple[TrainState, Any]:
     """The env steps of one cycle and nothing else; no episode ends."""
-    spaces = trainer.spec.action_spaces
+    chosen = [trainer.spec.policy(agent) for agent in range(trainer.spec.num_agents)]
     keys = jax.random.split(jax.random.key(0), (state.key.shape[0], trainer.schedule.num_envs))
 
     def one(env_state, key):
-        action = tuple(networks.to_env(space, networks.random_action(key, space, ())) for space in spaces)
+        action = tuple(policy.to_env(policy.random(key, ())) for policy in chosen)
         after = trainer.env.step(key, env_state, action)
         return after.state, after.reward.sum() + sum(part.sum() for part in after.observation)
 

@@ -11,6 +11,7 @@ import reference
 from learner_cases import BATCH, CASES, agents_of, drawn, numbers, random_rows, random_state
 
 from matd3_jax.core import networks, update
+from matd3_jax.core.policies import CategoricalPolicy, DeterministicPolicy
 
 TOLERANCE = 1e-10
 """Absolute and relative, both sides in float64: sums of some hundred terms round at about 1e-14, Adam's division by
@@ -46,18 +47,23 @@ class Program:
     def __call__(self, state, rows, known_noise=True):
         """Who samples or smooths gets the table's noise; whether there is noise at all stays the learner's choice."""
 
-        def act(space, output, draw, *scale, **squash):
-            draw = None if draw is None else noise_table("gumbel", space.size)
-            return real_act(space, output, draw, *scale, **squash)
+        def with_table(kind):
+            real_sample, real_smooth = kind.sample, kind.smooth
 
-        def smooth(space, action, draw, *options):
-            return real_smooth(space, action, noise_table("normal", space.size), *options)
+            def sample(policy, output, draw, *scale):
+                draw = None if draw is None else noise_table("gumbel", policy.size)
+                return real_sample(policy, output, draw, *scale)
 
-        real_act, real_smooth = networks.act, networks.smooth
+            def smooth(policy, action, draw, *options):
+                return real_smooth(policy, action, noise_table("normal", policy.size), *options)
+
+            patch.setattr(kind, "sample", sample)
+            patch.setattr(kind, "smooth", smooth)
+
         with jax.enable_x64(True), pytest.MonkeyPatch.context() as patch:
             if known_noise:
-                patch.setattr(networks, "act", act)
-                patch.setattr(networks, "smooth", smooth)
+                with_table(DeterministicPolicy)
+                with_table(CategoricalPolicy)
             return jax.tree.map(np.asarray, self.jitted(state, rows))
 
     def inputs(self, seed=0):

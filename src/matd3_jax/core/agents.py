@@ -8,7 +8,11 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from matd3_jax.core import critics, policies
 from matd3_jax.core.algorithm import Algorithm
+from matd3_jax.core.critics import Critic
+from matd3_jax.core.networks import StackedMLP
+from matd3_jax.core.policies import Policy
 from matd3_jax.envs.environment import Environment
 from matd3_jax.envs.spaces import ActionSpace
 
@@ -21,6 +25,26 @@ class Group:
     observation_size: int
     action_space: ActionSpace
     algorithm: Algorithm
+
+    @property
+    def policy(self) -> Policy:
+        """How an actor's output becomes an action."""
+        return policies.of(self.action_space, self.algorithm)
+
+    @property
+    def actor(self) -> StackedMLP:
+        """The actor of one member: observations [batch, observation_size] to outputs [batch, action size]."""
+        return StackedMLP((), (*self.algorithm.hidden, self.action_space.size))
+
+    @property
+    def actors(self) -> StackedMLP:
+        """The actors of all members, stacked: [members, batch, ...]."""
+        return StackedMLP((len(self.members),), (*self.algorithm.hidden, self.action_space.size))
+
+    @property
+    def critic(self) -> Critic:
+        """The critics of one member."""
+        return critics.of(self.algorithm)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,6 +115,10 @@ class Spec:
         """(group number, place among its members) of an agent."""
         g = next(g for g, group in enumerate(self.groups) if agent in group.members)
         return g, self.groups[g].members.index(agent)
+
+    def policy(self, agent: int) -> Policy:
+        """How an agent's action follows from its actor's output."""
+        return policies.of(self.action_spaces[agent], self.algorithms[agent])
 
     # ---- replay rows -------------------------------------------------------------------------------------------------
 

@@ -1,15 +1,12 @@
-"""Actors and critics. The members of a group, and the twin critics of each, are one batched network."""
+"""Stacks of perceptrons: the members of a group, and the twin critics of each, are one batched network."""
 
 import math
-from collections.abc import Callable
 
 import chex
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
-
-from matd3_jax.envs.spaces import ActionSpace, Box, Discrete, Simplex
 
 
 class StackedMLP(nn.Module):
@@ -103,101 +100,6 @@ def _product(x: chex.Array, kernel: chex.Array) -> chex.Array:
     return jnp.moveaxis(y, -2, -3).reshape(*kernel.shape[:leading], *rest, *x.shape[leading:-1], j)
 
 
-def actor_network(stack: tuple[int, ...], hidden: tuple[int, ...], space: ActionSpace) -> StackedMLP:
-    """Actors: observations [*stack, batch, size] to outputs [*stack, batch, action size]."""
-    return StackedMLP(stack, (*hidden, space.size))
-
-
-def critic_network(num_critics: int, hidden: tuple[int, ...]) -> StackedMLP:
-    """The critics of one agent: inputs [batch, size] to values [num_critics, batch, 1]."""
-    return StackedMLP((num_critics,), (*hidden, 1))
-
-
-# ---- actions from actor outputs --------------------------------------------------------------------------------------
-
-
-def noise(key: chex.PRNGKey, space: ActionSpace, shape: tuple[int, ...]) -> chex.Array:
-    """The noise that `act` takes for one space, [*shape, space.size]: Gumbel for choices, standard normal for a Box."""
-    draw = jax.random.normal if isinstance(space, Box) else jax.random.gumbel
-    return flat_draw(draw, key, (*shape, space.size))
-
-
-def flat_draw(draw: Callable, key: chex.PRNGKey, shape: tuple[int, ...]) -> chex.Array:
-    """`draw(key, shape)`, computed along one long axis: three times as fast on a CPU as with a short last axis."""
-    return draw(key, (math.prod(shape),)).reshape(shape)
-
-
-def policy_noise(key: chex.PRNGKey, space: ActionSpace, shape: tuple[int, ...]) -> chex.Array | None:
-    """The noise of the policy itself, without exploration: Gumbel for choices, none for a Box."""
-    return None if isinstance(space, Box) else noise(key, space, shape)
-
-
-def act(
-    space: ActionSpace,
-    output: chex.Array,
-    draw: chex.Array | None,
-    scale: chex.Array | float = 0.0,
-    squash: str = "sigmoid",
-) -> chex.Array:
-    """Action vectors [..., space.size] from actor outputs [..., space.size].
-
-    Choices: softmax(logits + Gumbel noise) at temperature 1 for each part, soft as it is for a `Simplex`; one-hot with
-    the soft sample's gradient (straight-through) for hard choices. Box: the squashed output, plus `scale` half ranges
-    of Gaussian noise, kept inside the Box.
-
-    Args:
-        draw: noise as from `noise`; None for the deterministic action (no noise: softmax(logits), the likeliest
-            choice, or the squashed output).
-        scale: standard deviation of the Gaussian noise in half ranges; only for a Box.
-        squash: `Algorithm.actor_output`; only for a Box.
-    """
-    if isinstance(space, Box):
-        half = (space.high - space.low) / 2
-        if squash == "tanh":
-            action = space.low + half + half * jnp.tanh(output)
-        else:
-            action = space.low + 2 * half * jax.nn.sigmoid(output)
-        if draw is None:
-            return action
-        return jnp.clip(action + scale * half * draw, space.low, space.high)
-    logits = output if draw is None else output + draw
-    return jnp.concatenate([_choose(part, isinstance(space, Simplex)) for part in split(logits, space)], axis=-1)
-
-
-def random_action(key: chex.PRNGKey, space: ActionSpace, shape: tuple[int, ...]) -> chex.Array:
-    """Action vectors [*shape, space.size] drawn uniformly: from the Box, or by zero logits."""
-    if isinstance(space, Box):
-        return jax.random.uniform(key, (*shape, space.size), minval=space.low, maxval=space.high)
-    return act(space, jnp.zeros((*shape, space.size)), noise(key, space, shape))
-
-
-def smooth(space: ActionSpace, action: chex.Array, draw: chex.Array, sigma: chex.Array, clip: chex.Array) -> chex.Array:
-    """Target policy smoothing (PAPER eq. for y_i): action + clip(sigma * draw, -clip, clip), in half ranges and kept
-    inside a Box; for choices added to the vectors without projecting back, as in the authors' program."""
-    epsilon = jnp.clip(sigma * draw, -clip, clip)
-    if isinstance(space, Box):
-        return jnp.clip(action + epsilon * (space.high - space.low) / 2, space.low, space.high)
-    return action + epsilon
-
-
-def split(vector: chex.Array, space: ActionSpace) -> list[chex.Array]:
-    """The parts of a vector of several choices, each [..., size of the part]."""
-    assert not isinstance(space, Box)
-    ends = [sum(space.sizes[: i + 1]) for i in range(len(space.sizes))]
-    return [vector[..., end - size : end] for end, size in zip(ends, space.sizes, strict=True)]
-
-
-def _choose(logits: chex.Array, soft: bool) -> chex.Array:
-    sample = jax.nn.softmax(logits)
-    if soft:
-        return sample
-    hard = jax.nn.one_hot(jnp.argmax(sample, -1), sample.shape[-1], dtype=sample.dtype)
-    return hard + (sample - jax.lax.stop_gradient(sample))  # the bracket is exactly 0: the choice stays one-hot
-
-
-def to_env(space: ActionSpace, action: chex.Array) -> chex.Array:
-    """What `Environment.step` takes for an action vector: the vector, or the number(s) of hard choices."""
-    if isinstance(space, Box | Simplex):
-        return action
-    chosen = [jnp.argmax(part, -1).astype(jnp.int32) for part in split(action, space)]
-    return chosen[0] if isinstance(space, Discrete) else jnp.stack(chosen, -1)
+def apply(network: StackedMLP, params: chex.ArrayTree, *args) -> chex.Array:
+    """Outputs of a network with the parameters `params`."""
+    return network.apply({"params": params}, *args)  # type: ignore[return-value]

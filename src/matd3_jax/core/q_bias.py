@@ -12,7 +12,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from matd3_jax.core import networks, rollout, running_statistics, update
+from matd3_jax.core import rollout, running_statistics
 from matd3_jax.core.agents import Spec
 from matd3_jax.core.rollout import Policy
 from matd3_jax.envs.environment import Environment
@@ -88,13 +88,12 @@ def estimate(spec: Spec, policy: Policy, critics: Sequence[chex.ArrayTree], inpu
         x = running_statistics.normalise(policy.statistics, x)
     values: list[Any] = [None] * spec.num_agents
     for group, params in zip(spec.groups, critics, strict=True):
-        network = networks.critic_network(group.algorithm.num_critics, group.algorithm.hidden)
         for k, i in enumerate(group.members):
             parts = [x, action]
             if group.algorithm.critic == "own":
                 parts = [spec.observation_part(x, i), spec.action_part(action, i)]
             own = jax.tree.map(lambda leaf, k=k: leaf[k], params)
-            value = update.apply(network, own, jnp.concatenate(parts, axis=-1))[..., 0].mean(axis=0)
+            value = group.critic.values(own, jnp.concatenate(parts, axis=-1)).mean(axis=0)
             values[i] = value / group.algorithm.reward_scale
     return jnp.stack(values, axis=-1)
 
@@ -112,7 +111,7 @@ def play_out(env: Environment, spec: Spec, policy: Policy, pairs: Pairs, key: ch
     gamma = jnp.stack([jnp.asarray(policy.hyper[spec.place(i)[0]].gamma) for i in range(spec.num_agents)])
     # All noise in one draw for each group, not one for each step; None for a Box.
     noise = tuple(
-        networks.policy_noise(jax.random.fold_in(noise_key, g), group.action_space, (steps, len(group.members), number))
+        group.policy.own_noise(jax.random.fold_in(noise_key, g), (steps, len(group.members), number))
         for g, group in enumerate(spec.groups)
     )
 

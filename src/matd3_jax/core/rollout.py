@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from matd3_jax.core import networks, running_statistics, update
+from matd3_jax.core import networks, running_statistics
 from matd3_jax.core.agents import Spec
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.running_statistics import Statistics
@@ -208,7 +208,7 @@ def act(
     """Joint actions [envs, action_size] for one observation [envs, size] per agent.
 
     Args:
-        draws: noise [members, envs, action size] per group (see `networks.noise`); None, for one group or all:
+        draws: noise [members, envs, action size] per group (see `Policy.noise`); None, for one group or all:
             deterministic actions.
         noise_quantile: [envs, num_agents] where in its range the exploration noise of an agent that has one is;
             outside of collecting the middle.
@@ -218,26 +218,27 @@ def act(
         observation = [running_statistics.normalise_part(spec, statistics, o, i) for i, o in enumerate(observation)]
     for g, group in enumerate(spec.groups):
         stacked = jnp.stack([observation[i] for i in group.members])
-        output = update.apply(update.actor_of(group), policy.actors[g], stacked)
+        output = networks.apply(group.actors, policy.actors[g], stacked)
         draw = None if draws is None else draws[g]
         scale = policy.hyper[g].exploration_noise
         if group.algorithm.noise_range:
             quantile = jnp.broadcast_to(noise_quantile, (stacked.shape[1], spec.num_agents))
             own = quantile[:, np.array(group.members)].T[..., None]
             scale = scale + own * (policy.hyper[g].exploration_noise_high - scale)
-        parts.append(networks.act(group.action_space, output, draw, scale, group.algorithm.actor_output))
+        parts.append(group.policy.sample(output, draw, scale))
     return spec.join_actions(parts)
 
 
 def env_actions(spec: Spec, action: chex.Array) -> tuple[chex.Array, ...]:
     """What `Environment.step` takes, of joint action vectors [..., action_size]."""
-    return tuple(networks.to_env(space, spec.action_part(action, i)) for i, space in enumerate(spec.action_spaces))
+    return tuple(spec.policy(i).to_env(spec.action_part(action, i)) for i in range(spec.num_agents))
 
 
 def _noise(spec: Spec, key: chex.PRNGKey, shape: tuple[int, ...], random: bool = False) -> tuple[chex.Array, ...]:
     """Noise [*shape[:-1], members, shape[-1], action size] of every group; `random`: whole random actions instead."""
-    draw = networks.random_action if random else networks.noise
     return tuple(
-        draw(jax.random.fold_in(key, g), group.action_space, (*shape[:-1], len(group.members), shape[-1]))
+        (group.policy.random if random else group.policy.noise)(
+            jax.random.fold_in(key, g), (*shape[:-1], len(group.members), shape[-1])
+        )
         for g, group in enumerate(spec.groups)
     )

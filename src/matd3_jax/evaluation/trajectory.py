@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from matd3_jax.core import networks, rollout
+from matd3_jax.core import rollout
 from matd3_jax.core.agents import Spec
 from matd3_jax.training.loop import TrainState
 from matd3_jax.training.session import Training
@@ -129,6 +129,5 @@ def play(
 def _noise(spec: Spec, key: chex.PRNGKey) -> tuple[chex.Array, ...]:
     """Exploration noise [members, 1, action size] of every group."""
     return tuple(
-        networks.noise(jax.random.fold_in(key, g), group.action_space, (len(group.members), 1))
-        for g, group in enumerate(spec.groups)
+        group.policy.noise(jax.random.fold_in(key, g), (len(group.members), 1)) for g, group in enumerate(spec.groups)
     )

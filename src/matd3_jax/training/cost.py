@@ -47,7 +47,7 @@ def step_flops(spec: Spec, schedule: Schedule) -> float:
 
 
 def _member(spec: Spec, schedule: Schedule, group: Group) -> float:
-    """Multiplications of one agent's update, for each transition: see `update._update_agent`."""
+    """Multiplications of one agent's update, for each transition: see `core.losses`."""
     algorithm, size = group.algorithm, group.action_space.size
     actor, critic = _actor(group), (update.critic_input_size(spec, group), *group.algorithm.hidden, 1)
     target_actions = _forward(actor)

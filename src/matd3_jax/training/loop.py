@@ -12,7 +12,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from matd3_jax.core import n_step, q_bias, replay, rollout, running_statistics, update
+from matd3_jax.core import minibatch, n_step, q_bias, replay, rollout, running_statistics, update
 from matd3_jax.core.agents import Spec
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.q_bias import Pairs, Reservoir, Values
@@ -298,7 +298,7 @@ class Trainer:
             for u in range(unrolled):
                 index_key, update_key = jax.random.split(keys[u])
                 indices = replay.sample_indices(index_key, size, (batches, schedule.batch_size))
-                rows = self.minibatches(state, hyper, seed, update.own_part(indices, axis, dimension=-1))
+                rows = self.minibatches(state, hyper, seed, minibatch.own_part(indices, axis, dimension=-1))
                 move = [(first + u + 1) % group.algorithm.policy_delay == 0 for group in groups]
                 states, m = update.update(
                     self.spec, states, hyper, rows, update_key, move, schedule.sequential, self.on_cpu, axis

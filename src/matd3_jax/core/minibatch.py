@@ -1,0 +1,129 @@
+"""What one agent learns from in one update: its parts of replay rows, and its random numbers."""
+
+from typing import NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from matd3_jax.core.agents import Group, Spec
+from matd3_jax.core.policies import Policy, flat_draw
+
+
+class Place(NamedTuple):
+    """Where an agent stands, int32 scalars; leaves [members] for several."""
+
+    agent: chex.Array
+    """Its number."""
+    observation: chex.Array
+    """First entry of o_i in x."""
+    action: chex.Array
+    """First entry of a_i in the joint action."""
+
+
+class Minibatch(NamedTuple):
+    """What one agent learns from in one update."""
+
+    observation: chex.Array
+    """[batch, observation size] o_i."""
+    action: chex.Array
+    """[batch, action size] a_i as replayed."""
+    inputs: chex.Array
+    """[batch, critic inputs] what the critics read: x and a, or o_i and a_i."""
+    reward: chex.Array
+    """[batch] r_i; with n_step > 1 the return's sum of discounted rewards."""
+    discount: chex.Array
+    """[batch] 0 where the episode terminated, else 1; with n_step > 1 times gamma^(m - 1)."""
+    next_observations: tuple[chex.Array, ...]
+    """o' of those whose target actors the target needs, one array [agents, batch, observation size] per group."""
+    next_x: chex.Array
+    """[batch, critic inputs without actions] x', or o'_i."""
+    action_column: chex.Array | int
+    """Where a_i stands in `inputs`."""
+
+
+class Noise(NamedTuple):
+    """All random numbers of one agent's update; a leading axis [members] for several."""
+
+    target: tuple[chex.Array | None, ...]
+    """Of the target actors' own sampling, [agents, batch, action size] per group of `next_observations`."""
+    smoothing: tuple[chex.Array | None, ...]
+    """Standard normal, of the same shapes; None without smoothing."""
+    action: chex.Array | None
+    """[batch, action size] of the own new action."""
+
+
+def places(spec: Spec, group: Group) -> Place:
+    """Of all members, leaves [members]."""
+    members = np.array(group.members)
+    return Place(members, np.array(spec.observation_starts)[members], np.array(spec.action_starts)[members])
+
+
+def minibatch(spec: Spec, group: Group, rows: chex.Array, place: Place, gamma: chex.Array | float) -> Minibatch:
+    """The minibatch of one member from its rows [batch, row_size]."""
+    central = group.algorithm.critic == "central"
+    parts = spec.row_parts(rows)
+
+    def part(whole: chex.Array, start: chex.Array, size: int) -> chex.Array:
+        return jax.lax.dynamic_slice_in_dim(whole, start, size, axis=-1)
+
+    observation = part(parts.x, place.observation, group.observation_size)
+    action = part(parts.action, place.action, group.action_space.size)
+    own_next = part(parts.next_x, place.observation, group.observation_size)
+    every_next = tuple(
+        jnp.stack([spec.observation_part(parts.next_x, j) for j in other.members]) for other in spec.groups
+    )
+    return Minibatch(
+        observation=observation,
+        action=action,
+        inputs=parts.inputs if central else jnp.concatenate([observation, action], axis=-1),
+        reward=part(parts.reward, place.agent, 1)[..., 0],
+        discount=parts.discount if parts.more is None else parts.discount * gamma**parts.more,
+        next_observations=every_next if central else (own_next,),
+        next_x=parts.next_x if central else own_next,
+        action_column=spec.observation_size + place.action if central else group.observation_size,
+    )
+
+
+def draw_noise(spec: Spec, group: Group, shape: tuple[int, int], key: chex.PRNGKey, axis: str | None) -> Noise:
+    """The random numbers of a group's members; `shape`: minibatches (1: shared) and their size, on each device of
+    `axis` (which draws those of the whole minibatch, as one device would, and takes its own)."""
+    batches, local = shape
+    size = local * (1 if axis is None else jax.lax.axis_size(axis))
+    members = len(group.members)
+    action_key, target_key, smooth_key = jax.random.split(key, 3)
+    wanted: list[tuple[Policy, tuple[int, ...]]]
+    if group.algorithm.critic == "central":
+        wanted = [(other.policy, (len(other.members), size)) for other in spec.groups]
+    else:
+        wanted, batches = [(group.policy, (size,))], members  # nobody shares an own action
+
+    def draws(draw, key):
+        drawn = []
+        for j, (policy, lead) in enumerate(wanted):
+            one = draw(policy, jax.random.fold_in(key, j), (1 if batches == 1 else members, *lead))
+            # With a shared minibatch all agents look at the same target actions.
+            drawn.append(None if one is None else jnp.broadcast_to(one, (members, *one.shape[1:])))
+        return tuple(drawn)
+
+    def own(policy, key, lead):
+        return policy.own_noise(key, lead)
+
+    def normal(policy, key, lead):
+        return flat_draw(jax.random.normal, key, (*lead, policy.size)) if group.algorithm.smoothing else None
+
+    noise = Noise(
+        target=draws(own, target_key),
+        smoothing=draws(normal, smooth_key),
+        action=group.policy.own_noise(action_key, (members, size)),
+    )
+    return jax.tree.map(lambda draw: own_part(draw, axis, dimension=-2), noise)
+
+
+def own_part(whole: chex.Array, axis: str | None, dimension: int) -> chex.Array:
+    """This device's equal part of an array along `dimension`, one of as many as the mesh axis has devices."""
+    if axis is None:
+        return whole
+    size = whole.shape[dimension] // jax.lax.axis_size(axis)
+    return jax.lax.dynamic_slice_in_dim(whole, jax.lax.axis_index(axis) * size, size, dimension)
