@@ -82,11 +82,11 @@ class Floor:
 
 def products(trainer: Trainer, part: str = "loop") -> dict[Product, float]:
     """How many of each product one device does in one cycle: of the "rollout", the "update", or the whole "loop"."""
-    schedule, spec = trainer.schedule, trainer.spec
+    schedule, layout = trainer.schedule, trainer.layout
     found: dict[Product, float] = {}
     local = trainer.local_seeds
     updates = trainer.cycle_collects * schedule.updates_per_collect
-    for group in spec.groups:
+    for group in layout.groups:
         together = trainer.piece * (1 if trainer.on_cpu else len(group.members))
         times = local * len(group.members) / together * updates
         for product, share in _update(trainer, group) if part != "rollout" else ():
@@ -101,17 +101,17 @@ def products(trainer: Trainer, part: str = "loop") -> dict[Product, float]:
 
 def _update(trainer: Trainer, group: Group) -> Iterator[tuple[Product, float]]:
     """(product, how many an update) of one agent of the group: see `core.losses`."""
-    spec, algorithm = trainer.spec, group.algorithm
+    layout, algorithm = trainer.layout, group.algorithm
     batch = trainer.schedule.batch_size // trainer.devices_per_seed
     hidden, delay = algorithm.hidden, algorithm.policy_delay
     central = algorithm.critic == "central"
     # With one minibatch for all, the members of a group share their target actions.
     shared = len(group.members) if trainer.schedule.shared_minibatch and central else 1
-    for other in spec.groups if central else (group,):
+    for other in layout.groups if central else (group,):
         sizes = (other.observation_size, *other.algorithm.hidden, other.action_space.size)
         members = (len(other.members),) if central else ()
         yield from ((part, 1 / shared) for part in _forward(members, batch, sizes))
-    critic = (update.critic_input_size(spec, group), *hidden, 1)
+    critic = (update.critic_input_size(layout, group), *hidden, 1)
     twins = algorithm.num_critics
     forward = [*_wide(twins, batch, critic), *_forward((twins,), batch, critic)[1:]]
     yield from ((part, 2) for part in forward)  # targets, and the critics themselves
@@ -164,11 +164,11 @@ def _batched(product: Product, together: int) -> Product:
 def least_bytes(trainer: Trainer, part: str = "loop") -> int:
     """Bytes of one cycle, all seeds, that cannot stay in a cache: minibatches read from the replay, new rows written,
     networks and optimisers read and written once an update (twice for what is moved along)."""
-    schedule, spec = trainer.schedule, trainer.spec
-    batches = 1 if schedule.shared_minibatch else spec.num_agents
+    schedule, layout = trainer.schedule, trainer.layout
+    batches = 1 if schedule.shared_minibatch else layout.num_agents
     state = memory.size(trainer.abstract_state().groups) // trainer.rows
-    written = 4 * spec.row_size * schedule.collect_steps
-    read = schedule.updates_per_collect * (4 * spec.row_size * batches * schedule.batch_size + 2 * state)
+    written = 4 * layout.row_size * schedule.collect_steps
+    read = schedule.updates_per_collect * (4 * layout.row_size * batches * schedule.batch_size + 2 * state)
     return trainer.rows * trainer.cycle_collects * {"rollout": written, "update": read, "loop": written + read}[part]
 
 
@@ -224,7 +224,7 @@ def compiled_flops(trainer: Trainer) -> float:
     """`counted_flops` of one cycle of all seeds. On accelerators, where products are calls into libraries, those of the
     traced program."""
     state = trainer.abstract_state()
-    shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.spec.row_size)
+    shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.layout.row_size)
     state = state._replace(replay=jax.ShapeDtypeStruct(shape, jnp.float32))
     cycles = 2  # a loop that runs once may be unrolled
     traced = trainer.chunk(cycles).jitted.trace(state, trainer.hyper)
@@ -250,7 +250,7 @@ def _repeated(product: Product, count: int) -> tuple[Callable[[], Any], int]:
     """What does a product many times on each of `count` devices, and how many times. Operands come one after the other
     from a set of eight (fewer where they are large), so that they are no warmer in cache than in the loop."""
     mesh = jax.sharding.Mesh(np.array(jax.devices()[:count]), ("devices",))
-    spec = jax.sharding.PartitionSpec("devices")
+    layout = jax.sharding.PartitionSpec("devices")
     sets = max(1, min(8, 2**26 // (math.prod(product.left) + math.prod(product.right))))
     rounds = max(1, round(0.02 * 50e9 / (product.flops * sets)))
 
@@ -261,10 +261,10 @@ def _repeated(product: Product, count: int) -> tuple[Callable[[], Any], int]:
         return jax.lax.scan(lambda t, _: jax.lax.scan(one, t, (left[0], right[0])), jnp.zeros(()), None, rounds)[0]
 
     program = jax.jit(
-        jax.shard_map(lambda a, b: rounds_of(a, b)[None], mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+        jax.shard_map(lambda a, b: rounds_of(a, b)[None], mesh=mesh, in_specs=layout, out_specs=layout, check_vma=False)
     )
     left, right = (
-        jax.device_put(np.full((count, sets, *shape), 0.01, np.float32), jax.sharding.NamedSharding(mesh, spec))
+        jax.device_put(np.full((count, sets, *shape), 0.01, np.float32), jax.sharding.NamedSharding(mesh, layout))
         for shape in (product.left, product.right)
     )
     call = functools.partial(program, left, right)
@@ -276,11 +276,11 @@ def _repeated(product: Product, count: int) -> tuple[Callable[[], Any], int]:
 def bandwidth(repeats: int = 5, mebibytes: int = 256) -> float:
     """Bytes a second that all devices together read and write (x + 1 over an array far larger than any cache)."""
     mesh = jax.sharding.Mesh(np.array(jax.devices()), ("devices",))
-    spec = jax.sharding.PartitionSpec("devices")
+    layout = jax.sharding.PartitionSpec("devices")
     x = jax.device_put(
-        np.zeros((jax.device_count(), mebibytes * 2**18), np.float32), jax.sharding.NamedSharding(mesh, spec)
+        np.zeros((jax.device_count(), mebibytes * 2**18), np.float32), jax.sharding.NamedSharding(mesh, layout)
     )
-    program = jax.jit(jax.shard_map(lambda x: x + 1, mesh=mesh, in_specs=spec, out_specs=spec))
+    program = jax.jit(jax.shard_map(lambda x: x + 1, mesh=mesh, in_specs=layout, out_specs=layout))
     return 2 * x.nbytes / _median(lambda: program(x), repeats)
 
 

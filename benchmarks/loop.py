@@ -47,7 +47,7 @@ def main(argv: Sequence[str]) -> int:
         "product_flops_of_a_cycle": loop.cycle_flops,
         "compile_seconds": round(loop.compile_seconds, 1),
         "devices": trainer.mesh.size,
-        "row_numbers": trainer.spec.row_size,
+        "row_numbers": trainer.layout.row_size,
         "memory": {**loop.memory(), **process_memory()},
         "machine": devices.description(),
     }
@@ -100,8 +100,8 @@ class Loop:
 
 def copies_in(text: str, trainer: Trainer) -> int:
     """Copies of a device's whole replay in a compiled program (HLO text, as `Compiled.as_text` gives it)."""
-    schedule, spec = trainer.schedule, trainer.spec
-    local = f"{trainer.local_seeds},{schedule.replay_capacity},{spec.row_size}"
+    schedule, layout = trainer.schedule, trainer.layout
+    local = f"{trainer.local_seeds},{schedule.replay_capacity},{layout.row_size}"
     return len(re.findall(rf"f32\[{local}\]\S* copy(-start)?\(", text))
 
 

@@ -146,14 +146,14 @@ def parts(trainer: Trainer) -> dict[str, Callable[[TrainState, Any], Any]]:
 def matmul_gflops(repeats: int = 7) -> float:
     """Giga floating point operations a second of [1024, 128] x [128, 128] products on all devices together, median."""
     count, mesh = 200, jax.sharding.Mesh(np.array(jax.devices()), ("devices",))
-    spec = jax.sharding.PartitionSpec("devices")
+    layout = jax.sharding.PartitionSpec("devices")
     x = jnp.ones((jax.device_count(), 1024, 128)) / 128
 
     def products(x):
         w = jnp.ones((1, 128, 128)) / 128
         return jax.lax.fori_loop(0, count, lambda _, y: y @ w, x)
 
-    program = jax.jit(jax.shard_map(products, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
+    program = jax.jit(jax.shard_map(products, mesh=mesh, in_specs=layout, out_specs=layout, check_vma=False))
     times = []
     for _ in range(repeats + 1):
         begun = time.perf_counter()
@@ -171,7 +171,7 @@ def _collects(trainer: Trainer, state: TrainState, hyper: Any) -> tuple[TrainSta
 
 def _env_steps(trainer: Trainer, state: TrainState) -> tuple[TrainState, Any]:
     """The env steps of one cycle and nothing else; no episode ends."""
-    chosen = [trainer.spec.policy(agent) for agent in range(trainer.spec.num_agents)]
+    chosen = [trainer.layout.policy(agent) for agent in range(trainer.layout.num_agents)]
     keys = jax.random.split(jax.random.key(0), (state.key.shape[0], trainer.schedule.num_envs))
 
     def one(env_state, key):
@@ -188,7 +188,7 @@ def _gathers(trainer: Trainer, state: TrainState, hyper: Any) -> tuple[TrainStat
     """The minibatches of one cycle, read and summed."""
     schedule = trainer.schedule
     count = trainer.cycle_collects * schedule.updates_per_collect
-    batches = 1 if schedule.shared_minibatch else trainer.spec.num_agents
+    batches = 1 if schedule.shared_minibatch else trainer.layout.num_agents
     size = replay.filled(schedule.replay_capacity, schedule.collect_steps, state.collects)
     keys = jax.vmap(lambda key: jax.random.split(key, count + 1))(state.key)
 

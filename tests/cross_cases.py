@@ -50,7 +50,7 @@ def make(settings, env=None, number=0):
         shapes._replace(
             groups=groups,
             env=jax.tree.map(lambda shape: np.zeros(shape.shape, shape.dtype), shapes.env),
-            replay=jnp.zeros((trainer.rows, trainer.schedule.replay_capacity, training.spec.row_size)),
+            replay=jnp.zeros((trainer.rows, trainer.schedule.replay_capacity, training.layout.row_size)),
             key=trainer.fill(training.keys()),
             collects=jnp.int32(2),
             statistics=statistics,

@@ -12,7 +12,7 @@ import reference
 
 from matd3_jax import config
 from matd3_jax.core import n_step, replay, update
-from matd3_jax.core.agents import Spec
+from matd3_jax.core.agents import JointLayout
 from matd3_jax.envs import Box, Simplex, make
 from matd3_jax.envs.wrappers.joint_team import JointTeam
 
@@ -41,25 +41,25 @@ class Case:
         """AlgoConfig of each team."""
         return load(self.algo, self.adversary)
 
-    def spec(self) -> Spec:
+    def layout(self) -> JointLayout:
         return dataclasses.replace(self._spec(), n_step=self.n_step)
 
-    def _spec(self) -> Spec:
+    def _spec(self) -> JointLayout:
         if self.env == "interleaved":
             return interleaved(self.algorithms(("agents",))["agents"])
         env = make(self.env, **self.options)
         for team in dict.fromkeys(env.teams):
             if self.teams[team].joint:
                 env = JointTeam(env, team)
-        return Spec.of(env, self.algorithms(env.teams))
+        return JointLayout.of(env, self.algorithms(env.teams))
 
     def algorithms(self, teams):
         small = {"hidden": (6,), **self.changes}
         return {team: dataclasses.replace(self.teams[team].algorithm(), **small) for team in teams}
 
-    def hyper(self, spec):
+    def hyper(self, layout):
         """Per group; the numbers differ from each other and between groups, so that none can stand in for another."""
-        base = [self.teams[spec.teams[group.members[0]]].hyper_params() for group in spec.groups]
+        base = [self.teams[layout.teams[group.members[0]]].hyper_params() for group in layout.groups]
         return [
             h._replace(
                 actor_lr=h.actor_lr * (1 + g),
@@ -80,10 +80,10 @@ def load(algo, adversary):
     return config.load([f"algo={algo}", *([f"adversary={adversary}"] if adversary else [])]).teams()
 
 
-def interleaved(algorithm) -> Spec:
+def interleaved(algorithm) -> JointLayout:
     """Agents of two kinds in the order A, B, A, C, B: groups that are no neighbours."""
     one, two = Simplex((3,)), Box(2, -1.0, 3.0)
-    return Spec(
+    return JointLayout(
         agents=("a0", "b0", "a1", "c0", "b1"),
         teams=("agents",) * 5,
         observation_sizes=(4, 3, 4, 4, 3),
@@ -142,9 +142,9 @@ CASES = {
 }
 
 
-def random_state(spec, rng):
+def random_state(layout, rng):
     """Groups whose every number is random: biases, moments, and targets that differ from the online networks."""
-    shapes = jax.eval_shape(lambda key: update.init(spec, key), jax.random.key(0))
+    shapes = jax.eval_shape(lambda key: update.init(layout, key), jax.random.key(0))
 
     def fill(path, leaf):
         name = jax.tree_util.keystr(path)
@@ -158,30 +158,30 @@ def random_state(spec, rng):
     return jax.tree_util.tree_map_with_path(fill, shapes)
 
 
-def random_rows(spec, rng, batches, batch=BATCH):
+def random_rows(layout, rng, batches, batch=BATCH):
     """Replay rows [batches, batch, row_size], every other transition terminates; with n_step > 1 [batches, batch,
     n_step, row_size] in the order of play, half of them the last of an episode, and half of those terminate."""
-    if spec.n_step == 1:
-        rows = rng.normal(size=(batches, batch, spec.row_size))
+    if layout.n_step == 1:
+        rows = rng.normal(size=(batches, batch, layout.row_size))
         rows[..., -1] = np.arange(batch) % 2
         return rows
-    rows = rng.normal(size=(batches, batch, spec.n_step, spec.row_size))
+    rows = rng.normal(size=(batches, batch, layout.n_step, layout.row_size))
     more = rng.integers(0, 2, rows.shape[:-1])
-    rows[..., -2 - spec.observation_size] = more
+    rows[..., -2 - layout.observation_size] = more
     rows[..., -1] = np.maximum(more, rng.integers(0, 2, rows.shape[:-1]))
     return rows
 
 
-def drawn(spec, rows, hyper):
+def drawn(layout, rows, hyper):
     """What `n_step.draw` gives for such rows, put into a replay as those of batches * batch environments."""
-    if spec.n_step == 1:
+    if layout.n_step == 1:
         return rows
     batches, batch, n, size = rows.shape
     num_envs = batches * batch
     ring = jnp.moveaxis(rows, 2, 0).reshape(1, n * num_envs, size)
     written = replay.Written(n * num_envs, n * num_envs, 1)
-    gamma = jnp.array([hyper[spec.place(i)[0]].gamma for i in range(spec.num_agents)])
-    return n_step.draw(spec, ring, 0, jnp.arange(num_envs).reshape(batches, batch), written, num_envs, gamma)
+    gamma = jnp.array([hyper[layout.place(i)[0]].gamma for i in range(layout.num_agents)])
+    return n_step.draw(layout, ring, 0, jnp.arange(num_envs).reshape(batches, batch), written, num_envs, gamma)
 
 
 def layers(params, *place):
@@ -195,16 +195,16 @@ def adam(state: optax.ScaleByAdamState, member, *critic):
     return reference.Adam(layers(state.mu, *place), layers(state.nu, *place), int(state.count[member]))
 
 
-def agents_of(spec, state, hyper):
-    """The reference's agents, in the order of `spec.agents`, of the states of all groups."""
+def agents_of(layout, state, hyper):
+    """The reference's agents, in the order of `layout.agents`, of the states of all groups."""
     agents = {}
-    for group, s, h in zip(spec.groups, state, hyper, strict=True):
+    for group, s, h in zip(layout.groups, state, hyper, strict=True):
         for k, i in enumerate(group.members):
             critics = range(group.algorithm.num_critics)
             agents[i] = reference.Agent(
-                space=spec.action_spaces[i],
-                observation_size=spec.observation_sizes[i],
-                algorithm=spec.algorithms[i],
+                space=layout.action_spaces[i],
+                observation_size=layout.observation_sizes[i],
+                algorithm=layout.algorithms[i],
                 hyper=h,
                 actor=layers(s.actor, k),
                 actor_target=layers(s.actor_target, k),
@@ -214,7 +214,7 @@ def agents_of(spec, state, hyper):
                 critic_adams=[adam(s.critic_optimiser, k, c) for c in critics],
                 average=None if s.actor_average is None else layers(s.actor_average, k),
             )
-    return [agents[i] for i in range(spec.num_agents)]
+    return [agents[i] for i in range(layout.num_agents)]
 
 
 def numbers(

@@ -213,7 +213,7 @@ def test_a_replay_that_cannot_fit_is_refused_with_the_arithmetic():
 
 def test_several_steps_need_one_number_more():
     one, three = (Training(config.load([f"n_step={n}", "total_steps=100000"])) for n in (1, 3))
-    assert (one.spec.row_size, three.spec.row_size) == (127, 128)
+    assert (one.layout.row_size, three.layout.row_size) == (127, 128)
     assert "more" not in one.memory and "x 128 numbers" in three.memory and "rewards 3, more 1," in three.memory
 
 

@@ -37,15 +37,15 @@ def training(*settings, **options):
 def test_products_are_those_of_the_limits(settings):
     """Counted for one env step of one seed; there, product by product for a whole cycle of a device."""
     found = training(*settings)
-    trainer, spec, schedule = found.trainer, found.spec, found.trainer.schedule
+    trainer, layout, schedule = found.trainer, found.layout, found.trainer.schedule
     by_part = {
         part: sum(n * product.flops for product, n in limits.products(trainer, part).items())
         / (trainer.local_seeds * trainer.cycle_steps)
         for part in ("rollout", "loop")
     }
     assert trainer.devices_per_seed == 1
-    assert cost.acting_flops(spec) == pytest.approx(by_part["rollout"], rel=1e-12)
-    assert cost.step_flops(spec, schedule) == pytest.approx(by_part["loop"], rel=1e-12)
+    assert cost.acting_flops(layout) == pytest.approx(by_part["rollout"], rel=1e-12)
+    assert cost.step_flops(layout, schedule) == pytest.approx(by_part["loop"], rel=1e-12)
 
 
 def test_one_after_another_each_agent_runs_the_target_actors():
@@ -54,7 +54,7 @@ def test_one_after_another_each_agent_runs_the_target_actors():
         training("env=simple_spread", f"shared_minibatch={shared}", f"update_order={order}")
         for shared, order in (("true", "simultaneous"), ("true", "sequential"), ("false", "simultaneous"))
     )
-    flops = [cost.update_flops(t.spec, t.trainer.schedule) for t in (once, each, own)]
+    flops = [cost.update_flops(t.layout, t.trainer.schedule) for t in (once, each, own)]
     assert flops[0] < flops[1] == flops[2]
 
 
@@ -80,11 +80,11 @@ def test_the_expectation_by_hand(monkeypatch):
     monkeypatch.setattr(cost, "physics_rate", lambda *_: 5678.0)
     settings = (*ANT, "total_steps=20000", "learning_starts=10000", "replay_capacity=20000")
     found = training(*settings, "eval_every=1000", "eval_episodes=3")
-    spec, schedule, total = found.spec, found.trainer.schedule, found.total_steps
+    layout, schedule, total = found.layout, found.trainer.schedule, found.total_steps
     prefill = found.trainer.prefill_steps
     assert prefill < 10000 and 20000 <= total < 21000
     played = total + 12 * 3 * 1000  # evaluations after the prefill and at 10,000, 11,000 ... 20,000
-    flops = played * cost.acting_flops(spec) + (total - prefill) * cost.update_flops(spec, schedule)
+    flops = played * cost.acting_flops(layout) + (total - prefill) * cost.update_flops(layout, schedule)
     seconds = 2 * flops / (0.6 * 2e9) + played / 5678  # each of two devices steps one seed
     assert cost.expectation(found) == (
         f"expected: about {seconds / 60:.0f} minutes, compiling apart "

@@ -19,20 +19,20 @@ pytestmark = pytest.mark.usefixtures("quick_jit")
 
 def by_numpy(run, seed, team, observation):
     """{agent: action} of a team for everybody's observations, in float64, written from what a run's settings say."""
-    settings, spec = run.training.config, run.training.spec
+    settings, layout = run.training.config, run.training.layout
     who = [i for i, t in enumerate(ENV.teams) if t == team]
     algorithm = settings.teams()[team]
-    agents = [i for i, t in enumerate(spec.teams) if t == team]
+    agents = [i for i, t in enumerate(layout.teams) if t == team]
     seen = [observation[i] for i in who]
     if algorithm.joint:
         seen = [np.concatenate(seen)]
     actions = []
     for agent, x in zip(agents, seen, strict=True):
         if settings.normalise_observations:
-            start = sum(spec.observation_sizes[:agent])
+            start = sum(layout.observation_sizes[:agent])
             mean, variance = (np.float64(leaf)[seed, start : start + len(x)] for leaf in run.state.statistics)
             x = np.clip((x - mean) / np.sqrt(variance + 1e-8), -10, 10)
-        g, k = spec.place(agent)
+        g, k = layout.place(agent)
         logits, _ = reference.forward(layers(run.state.groups[g].actor, seed, k), x[None])
         actions += [reference.softmax(part[None])[0] for part in logits[0].reshape(-1, 5)]
     return dict(zip(who, actions, strict=True))
@@ -89,7 +89,7 @@ TWIN_SETTINGS = [*SMALL[2:], "seeds=2", "normalise_observations=true"]
 def test_a_group_across_teams():
     """Agents of both teams in one stack of networks: each team takes its own out, with its own statistics."""
     run = make(TWIN_SETTINGS, TWIN)
-    assert len(run.training.spec.groups) == 1
+    assert len(run.training.layout.groups) == 1
     played = meet({"twin": run}, "twin", "twin", OWN[:2], episodes=8, env=TWIN)
     found = run.training.evaluate(run.state, 8, True, SEED)
     np.testing.assert_allclose(played, found.episode_return.mean(axis=1), rtol=1e-5)

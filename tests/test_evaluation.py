@@ -33,9 +33,9 @@ def traced():
     """(result of a run with evaluations every 100 env steps, how often each kind of evaluation was compiled)."""
     count, real = collections.Counter(), rollout.evaluate
 
-    def evaluate(env, spec, policy, key, episodes, deterministic):
+    def evaluate(env, layout, policy, key, episodes, deterministic):
         count[episodes, deterministic] += 1
-        return real(env, spec, policy, key, episodes, deterministic)
+        return real(env, layout, policy, key, episodes, deterministic)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rollout, "evaluate", evaluate)
@@ -51,13 +51,13 @@ def run():
     return traced()[0]
 
 
-def play(spec, groups, seed, number):
+def play(layout, groups, seed, number):
     """(returns [agents], length) of a deterministic episode of Ledger with that number, in float64."""
     x, total = np.array([number, 0, 0, number, 0, 0, 0]), np.zeros(2)
     while True:
         action = []
         for i, o in enumerate((x[:3], x[3:])):
-            g, k = spec.place(i)
+            g, k = layout.place(i)
             logits, _ = reference.forward(layers(groups[g].actor, seed, k), o[None])
             action.append(reference.softmax(logits)[0])
         reward, x, terminated, truncated = by_hand(x, np.concatenate(action))
@@ -76,7 +76,7 @@ def test_episodes_by_hand():
     for seed in range(SEEDS):
         for e in range(20):
             number = found.measures[seed, e, 0]
-            returns, length = play(result.training.spec, groups, seed, number)
+            returns, length = play(result.training.layout, groups, seed, number)
             assert found.length[seed, e] == length == (ENDS if number < 0.5 else LIMIT)
             # float32: networks of 8 units, sums of at most 5 rewards of about 10.
             np.testing.assert_allclose(found.episode_return[seed, e], returns, rtol=1e-5)
@@ -100,7 +100,7 @@ def test_deterministic_evaluations_play_the_averaged_actors():
     got = training.evaluate(state, EPISODES, deterministic=True).episode_return
     np.testing.assert_array_equal(got, training.evaluate(swapped, EPISODES, deterministic=True).episode_return)
     np.testing.assert_array_equal(result.metrics["agent_0_eval_return"][:, -1], got[..., 0].mean(axis=1))
-    online = rollout.Policy(tuple(g.actor for g in state.groups), still.hyper, still.statistics)
+    online = rollout.PolicyParams(tuple(g.actor for g in state.groups), still.hyper, still.statistics)
     jax.tree.map(np.testing.assert_array_equal, still, online)
     sampled = [training.evaluate(s, EPISODES, deterministic=False).episode_return for s in (state, swapped)]
     assert (sampled[0] != sampled[1]).any()
@@ -192,7 +192,7 @@ def test_stops_when_all_episodes_have_ended():
     result = run()
     env = Counting(episode_length=1000)
     policy = jax.tree.map(lambda leaf: leaf[0], result.training.trainer.policy(result.state))
-    found = rollout.evaluate(env, result.training.spec, policy, jax.random.key(0), EPISODES, True)
+    found = rollout.evaluate(env, result.training.layout, policy, jax.random.key(0), EPISODES, True)
     jax.block_until_ready(found)
     jax.effects_barrier()
     assert found.length.max() == LIMIT
@@ -209,6 +209,6 @@ def test_cut_off_at_the_episode_length():
     result = run()
     policy = jax.tree.map(lambda leaf: leaf[0], result.training.trainer.policy(result.state))
     env = Endless(episode_length=8)
-    found = rollout.evaluate(env, result.training.spec, policy, jax.random.key(0), EPISODES, True)
+    found = rollout.evaluate(env, result.training.layout, policy, jax.random.key(0), EPISODES, True)
     np.testing.assert_array_equal(found.length, np.full(EPISODES, 8))
     np.testing.assert_allclose(found.measures[:, 1], 4.5)

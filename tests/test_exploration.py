@@ -9,9 +9,9 @@ import pytest
 from ledger import HYPER
 
 from matd3_jax.core import rollout, update
-from matd3_jax.core.agents import Spec
+from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
-from matd3_jax.core.rollout import Policy
+from matd3_jax.core.rollout import PolicyParams
 from matd3_jax.envs import make
 
 ENVS, LENGTH, EPISODE = 500, 12, 6
@@ -29,14 +29,14 @@ def collected():
     """
     env = make("point_reach", num_agents=2, episode_length=EPISODE)
     algorithm = Algorithm(hidden=(4,), noise_range=True)
-    spec = Spec.of(env, {"agents": algorithm})
+    layout = JointLayout.of(env, {"agents": algorithm})
     hyper = HYPER._replace(exploration_noise=LOW, exploration_noise_high=HIGH)
-    actors = tuple(jax.tree.map(jnp.zeros_like, g.actor) for g in update.init(spec, jax.random.key(0)))
-    policy = Policy(actors, (hyper,) * len(spec.groups), None)
-    start = rollout.start(env, jax.random.key(1), ENVS, rollout.ranged(spec))
-    end, rows, _, _ = jax.jit(lambda s: rollout.collect(env, spec, policy, s, jax.random.key(2), LENGTH))(start)
+    actors = tuple(jax.tree.map(jnp.zeros_like, g.actor) for g in update.init(layout, jax.random.key(0)))
+    policy = PolicyParams(actors, (hyper,) * len(layout.groups), None)
+    start = rollout.start(env, jax.random.key(1), ENVS, rollout.ranged(layout))
+    end, rows, _, _ = jax.jit(lambda s: rollout.collect(env, layout, policy, s, jax.random.key(2), LENGTH))(start)
     space = env.action_spaces[0]
-    action = np.asarray(spec.row_parts(rows).action).reshape(LENGTH, ENVS, 2, -1)
+    action = np.asarray(layout.row_parts(rows).action).reshape(LENGTH, ENVS, 2, -1)
     noise = (action - (space.high + space.low) / 2) / ((space.high - space.low) / 2)
     return np.asarray(start.noise_quantile), np.asarray(end.noise_quantile), noise
 
@@ -80,25 +80,26 @@ def test_without_a_range_nothing_is_kept_and_nothing_changes():
     env = make("point_reach", episode_length=EPISODE)
     found = {}
     for ranged in (False, True):
-        spec = Spec.of(env, {"agents": Algorithm(hidden=(4,), noise_range=ranged)})
-        groups = update.init(spec, jax.random.key(0))
+        layout = JointLayout.of(env, {"agents": Algorithm(hidden=(4,), noise_range=ranged)})
+        groups = update.init(layout, jax.random.key(0))
         hyper = HYPER._replace(exploration_noise=0.2, exploration_noise_high=0.2)
-        policy = Policy(tuple(g.actor for g in groups), (hyper,) * len(groups), None)
-        start = rollout.start(env, jax.random.key(1), 3, rollout.ranged(spec))
+        policy = PolicyParams(tuple(g.actor for g in groups), (hyper,) * len(groups), None)
+        start = rollout.start(env, jax.random.key(1), 3, rollout.ranged(layout))
         assert (start.noise_quantile is None) == (not ranged)
-        found[ranged] = rollout.collect(env, spec, policy, start, jax.random.key(2), LENGTH)[1]
+        found[ranged] = rollout.collect(env, layout, policy, start, jax.random.key(2), LENGTH)[1]
     np.testing.assert_array_equal(found[False], found[True])
 
 
 def test_outside_of_collecting_the_noise_is_in_the_middle_of_the_range():
     env = make("point_reach", num_agents=2)
     fixed, ranged = (
-        Spec.of(env, {"agents": Algorithm(hidden=(4,), noise_range=noise_range)}) for noise_range in (False, True)
+        JointLayout.of(env, {"agents": Algorithm(hidden=(4,), noise_range=noise_range)})
+        for noise_range in (False, True)
     )
     actors = tuple(g.actor for g in update.init(fixed, jax.random.key(0)))
     observation = [jnp.ones((5, size)) for size in env.observation_sizes]
-    middle = Policy(actors, (HYPER._replace(exploration_noise=0.3),), None)
-    ends = Policy(actors, (HYPER._replace(exploration_noise=0.2, exploration_noise_high=0.4),), None)
+    middle = PolicyParams(actors, (HYPER._replace(exploration_noise=0.3),), None)
+    ends = PolicyParams(actors, (HYPER._replace(exploration_noise=0.2, exploration_noise_high=0.4),), None)
     key = jax.random.key(3)
     one = rollout.decide(fixed, middle, observation, key)
     other = rollout.decide(ranged, ends, observation, key)
@@ -110,16 +111,16 @@ def test_mixed_teams_keep_their_own_noise():
     """A team with one number beside a team with a range: its actions are those it has beside anybody."""
     algorithms = {"agents": Algorithm(hidden=(4,), noise_range=True), "adversaries": Algorithm(hidden=(4,))}
     env = make("simple_tag", actions="continuous")
-    spec = Spec.of(env, algorithms)
-    plain = Spec.of(env, {team: dataclasses.replace(a, noise_range=False) for team, a in algorithms.items()})
-    actors = tuple(g.actor for g in update.init(spec, jax.random.key(0)))
+    layout = JointLayout.of(env, algorithms)
+    plain = JointLayout.of(env, {team: dataclasses.replace(a, noise_range=False) for team, a in algorithms.items()})
+    actors = tuple(g.actor for g in update.init(layout, jax.random.key(0)))
     hyper = HYPER._replace(exploration_noise=0.2, exploration_noise_high=0.4)
-    policy = Policy(actors, (hyper,) * len(spec.groups), None)
+    policy = PolicyParams(actors, (hyper,) * len(layout.groups), None)
     observation = [jnp.ones((5, size)) for size in env.observation_sizes]
-    draws = rollout._noise(spec, jax.random.key(1), (5,))
-    quantile = jnp.full((5, spec.num_agents), 0.9)
-    got = rollout.act(spec, policy, observation, draws, quantile)
+    draws = rollout._noise(layout, jax.random.key(1), (5,))
+    quantile = jnp.full((5, layout.num_agents), 0.9)
+    got = rollout.act(layout, policy, observation, draws, quantile)
     want = rollout.act(plain, policy, observation, draws)
-    for i, team in enumerate(spec.teams):
-        same = np.array_equal(spec.action_part(got, i), spec.action_part(want, i))
+    for i, team in enumerate(layout.teams):
+        same = np.array_equal(layout.action_part(got, i), layout.action_part(want, i))
         assert same == (team == "adversaries")

@@ -32,15 +32,15 @@ class Program:
     """The compiled update of a case in float64, with known noise; call it with (state, rows)."""
 
     def __init__(self, case):
-        self.case, self.spec = case, case.spec()
-        self.hyper = case.hyper(self.spec)
-        self.move = [self.spec.teams[group.members[0]] not in case.still for group in self.spec.groups]
-        self.batches = 1 if case.shared else self.spec.num_agents
+        self.case, self.layout = case, case.layout()
+        self.hyper = case.hyper(self.layout)
+        self.move = [self.layout.teams[group.members[0]] not in case.still for group in self.layout.groups]
+        self.batches = 1 if case.shared else self.layout.num_agents
 
         def run(state, rows):
             key, options = jax.random.key(0), {"sequential": case.sequential, "one_by_one": case.one_by_one}
-            rows = drawn(self.spec, rows, self.hyper)
-            return update.update(self.spec, state, self.hyper, rows, key, self.move, **options)
+            rows = drawn(self.layout, rows, self.hyper)
+            return update.update(self.layout, state, self.hyper, rows, key, self.move, **options)
 
         self.jitted = jax.jit(run)
 
@@ -69,10 +69,10 @@ class Program:
     def inputs(self, seed=0):
         rng = np.random.default_rng(seed)
         with jax.enable_x64(True):
-            return random_state(self.spec, rng), random_rows(self.spec, rng, self.batches)
+            return random_state(self.layout, rng), random_rows(self.layout, rng, self.batches)
 
     def reference(self, state, rows, sequential=None, alter=lambda agent: None):
-        agents = agents_of(self.spec, state, self.hyper)
+        agents = agents_of(self.layout, state, self.hyper)
         for agent in agents:
             alter(agent)
         return reference.update(
@@ -80,12 +80,12 @@ class Program:
             [rows[0 if self.case.shared else i] for i in range(len(agents))],
             gumbel=functools.partial(noise_table, "gumbel"),
             normal=functools.partial(noise_table, "normal"),
-            move=[self.spec.teams[i] not in self.case.still for i in range(len(agents))],
+            move=[self.layout.teams[i] not in self.case.still for i in range(len(agents))],
             sequential=self.case.sequential if sequential is None else sequential,
         )
 
     def agents(self, state):
-        return agents_of(self.spec, state, self.hyper)
+        return agents_of(self.layout, state, self.hyper)
 
 
 @functools.cache
@@ -122,10 +122,10 @@ def test_update_equals_reference(name):
         for path in want:
             assert np.shape(got[path]) == np.shape(want[path])
             np.testing.assert_allclose(
-                got[path], want[path], rtol=TOLERANCE, atol=TOLERANCE, err_msg=f"{name}, {p.spec.agents[i]}: {path}"
+                got[path], want[path], rtol=TOLERANCE, atol=TOLERANCE, err_msg=f"{name}, {p.layout.agents[i]}: {path}"
             )
     np.testing.assert_allclose(np.stack(metrics), losses, rtol=TOLERANCE, atol=TOLERANCE)
-    assert (clipped > 0) == (p.spec.algorithms[0].clip != "none")
+    assert (clipped > 0) == (p.layout.algorithms[0].clip != "none")
 
 
 @pytest.mark.parametrize("name", ["matd3", "box", "n-step", "tanh", "matd3-shared-sequential"])
@@ -179,7 +179,7 @@ def test_reference_tells_apart(name, field, value):
     if field == "algorithm.critic":
         # The critics' inputs would not fit: only check that the central critic does read the others' parts.
         rows = rows.copy()
-        rows[..., p.spec.observation_sizes[0]] += 1
+        rows[..., p.layout.observation_sizes[0]] += 1
         wrong, _, _ = p.reference(state, rows)
     else:
         sequential = value if field == "sequential" else None
@@ -199,16 +199,16 @@ def test_own_critic_reads_nothing_of_others():
     """Independent learners: whatever the others saw, did, got and will see, and whatever their networks are, the
     agent's update is the same bit for bit. (IL that peeks through the target or the actor loss is not IL.)"""
     p, state, rows, new, _ = base("iltd3")
-    spec, agent = p.spec, 2
-    own = np.zeros(spec.row_size, bool)
+    layout, agent = p.layout, 2
+    own = np.zeros(layout.row_size, bool)
     own[-1] = True
-    x, a = spec.observation_starts[agent], spec.action_starts[agent]
-    own[x : x + spec.observation_sizes[agent]] = True
-    own[spec.observation_size + a :][: spec.action_spaces[agent].size] = True
-    own[spec.observation_size + spec.action_size + agent] = True
-    own[-1 - spec.observation_size + x :][: spec.observation_sizes[agent]] = True
+    x, a = layout.observation_starts[agent], layout.action_starts[agent]
+    own[x : x + layout.observation_sizes[agent]] = True
+    own[layout.observation_size + a :][: layout.action_spaces[agent].size] = True
+    own[layout.observation_size + layout.action_size + agent] = True
+    own[-1 - layout.observation_size + x :][: layout.observation_sizes[agent]] = True
     other_rows = np.where(own, rows, rows + 1)
-    k = spec.groups[-1].members.index(agent)
+    k = layout.groups[-1].members.index(agent)
     other_state = jax.tree.map(lambda leaf: leaf + leaf.dtype.type(1), state)
     last = jax.tree.map(
         lambda old, moved: np.concatenate([moved[:k], old[k : k + 1], moved[k + 1 :]]), state[-1], other_state[-1]
@@ -262,7 +262,7 @@ def test_terminated_rows_have_no_future():
     ended = rows.copy()
     ended[..., -1] = 0
     first, _ = p(state, ended)
-    ended[..., -1 - p.spec.observation_size : -1] += 1
+    ended[..., -1 - p.layout.observation_size : -1] += 1
     second, _ = p(state, ended)
     for one, other in zip(p.agents(first), p.agents(second), strict=True):
         assert not differing(one, other)
@@ -302,7 +302,7 @@ def test_draws_have_their_own_keys(monkeypatch):
 
     def run(state, rows):
         keys.clear()
-        update.update(p.spec, state, p.hyper, rows, jax.random.key(1), p.move, sequential=True)
+        update.update(p.layout, state, p.hyper, rows, jax.random.key(1), p.move, sequential=True)
         return jnp.stack(keys)
 
     p.jitted = jax.jit(run)

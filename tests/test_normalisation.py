@@ -11,7 +11,7 @@ from learner_cases import layers
 from ledger import HYPER
 
 from matd3_jax.core import rollout, running_statistics
-from matd3_jax.core.agents import Spec
+from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.envs import make
@@ -28,9 +28,9 @@ pytestmark = pytest.mark.usefixtures("quick_jit")
 
 
 def trainer(n_step=1, normalise=True):
-    spec = Spec.of(ENV, {"agents": ALGORITHM}, n_step)
+    layout = JointLayout.of(ENV, {"agents": ALGORITHM}, n_step)
     hyper = {"agents": HYPER._replace(exploration_noise=0.0)}
-    return Trainer(ENV, spec, SCHEDULE, hyper, SEEDS, normalise_observations=normalise)
+    return Trainer(ENV, layout, SCHEDULE, hyper, SEEDS, normalise_observations=normalise)
 
 
 def in_numpy(state):
@@ -166,7 +166,7 @@ def test_evaluation_reads_normalised_observations():
     policy = jax.tree.map(lambda leaf: leaf[seed], t.policy(state))
     env = make("point_reach", num_agents=2, dim=2, episode_length=1)
     key = jax.random.key(3)
-    found = rollout.evaluate(env, t.spec, policy, key, 5, deterministic=True)
+    found = rollout.evaluate(env, t.layout, policy, key, 5, deterministic=True)
     first, observation = jax.vmap(env.reset)(jax.random.split(jax.random.split(key)[0], 5))
     x = np.concatenate(observation, axis=1).astype(np.float64)
     force = actions(states[-1].groups, seed, by_numpy(of_seed(states[-1].statistics, seed), x)).reshape(5, 2, 2)
@@ -189,7 +189,7 @@ def test_updates_read_normalised_observations(n_step):
         state = state._replace(replay=jnp.concatenate([rows[0], jnp.ones_like(rows[0][..., :1]), rows[1]], axis=-1))
         next_x = slice(19, 31)
     indices = jnp.arange(CAPACITY).reshape(2, -1)
-    columns = np.zeros(t.spec.row_size, bool)
+    columns = np.zeros(t.layout.row_size, bool)
     columns[:12] = columns[next_x] = True
     for seed in range(SEEDS):
         got = np.asarray(jax.jit(t.minibatches)(state, [HYPER], seed, indices))

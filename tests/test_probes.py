@@ -14,7 +14,7 @@ import reference
 from learner_cases import layers
 from ledger import HYPER
 
-from matd3_jax.core.agents import Spec
+from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.envs import Box, Environment, Simplex, TimeStep
 from matd3_jax.training.loop import Trainer
@@ -93,25 +93,25 @@ ENV = Probes()
 
 @functools.cache
 def trained(name):
-    """(spec, groups, replay) after 1,120 updates, in NumPy."""
+    """(layout, groups, replay) after 1,120 updates, in NumPy."""
     name, n_step = N_STEP.get(name, (name, 1))
-    spec = Spec.of(ENV, {"agents": ALGORITHMS[name]}, n_step)
+    layout = JointLayout.of(ENV, {"agents": ALGORITHMS[name]}, n_step)
     schedule = Schedule(
         num_envs=16, rollout_length=4, updates_per_collect=16, batch_size=64, replay_capacity=3200, learning_starts=64
     )
-    trainer = Trainer(ENV, spec, schedule, {"agents": HYPER}, 2)
+    trainer = Trainer(ENV, layout, schedule, {"agents": HYPER}, 2)
     state, metrics = trainer.chunk(70)(trainer.init(jax.vmap(jax.random.key)(jnp.arange(2))))
     assert np.isfinite(metrics.update.critic_loss).all()
-    return spec, jax.tree.map(np.asarray, state.groups), np.asarray(state.replay)
+    return layout, jax.tree.map(np.asarray, state.groups), np.asarray(state.replay)
 
 
 def values(name, agent, seed=CRITICS):
     """(observations, actions of all, first critic's values) on the replay's rows, for one agent by name."""
-    spec, groups, rows = trained(name)
+    layout, groups, rows = trained(name)
     i = ENV.agents.index(agent)
-    g, k = spec.place(i)
+    g, k = layout.place(i)
     x, action = rows[seed, :, :21].reshape(-1, 7, 3), rows[seed, :, 21:34]
-    if spec.algorithms[i].critic == "central":
+    if layout.algorithms[i].critic == "central":
         inputs = rows[seed, :, :34]
     else:
         inputs = np.concatenate([x[:, i], action[:, 2 * i : 2 * i + 2]], axis=1)
@@ -162,13 +162,13 @@ def test_reward_of_two(name):
 def test_actors_find_the_best_action(name):
     """The likeliest choice depends on the sign as it should, and nearly surely; the force comes near half of the sign
     (the reward is flat there: 0.3 beside it costs 0.09 of the 1 between the best force and the worst nearby)."""
-    spec, groups, _ = trained(name)
+    layout, groups, _ = trained(name)
     for agent in ("choice", "force"):
         i = ENV.agents.index(agent)
-        g, k = spec.place(i)
+        g, k = layout.place(i)
         for sign in (-1, 1):
             output, _ = reference.forward(layers(groups[g].actor, ACTORS, k), np.array([[0, sign, 1], [1, sign, 1]]))
-            action, _ = reference.act(spec.action_spaces[i], output, 0)
+            action, _ = reference.act(layout.action_spaces[i], output, 0)
             if agent == "choice":
                 assert (sign * (action[:, 0] - action[:, 1]) > 0.8).all()
             else:

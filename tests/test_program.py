@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import pytest
 from ledger import HYPER
 
-from matd3_jax.core.agents import Spec
+from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.envs import make
 from matd3_jax.training.loop import Trainer
@@ -27,9 +27,9 @@ def trainer(request):
     """Of one seed or two on one device: their loops are compiled differently."""
     env = make("point_reach", dim=1)
     seeds, n_step = request.param
-    spec = Spec.of(env, {"agents": Algorithm(hidden=(4,), smoothing=True)}, n_step)
+    layout = JointLayout.of(env, {"agents": Algorithm(hidden=(4,), smoothing=True)}, n_step)
     schedule = Schedule(num_envs=2, rollout_length=3, batch_size=8, replay_capacity=CAPACITY, learning_starts=1)
-    return Trainer(env, spec, schedule, {"agents": HYPER}, seeds, devices=jax.devices()[:1])
+    return Trainer(env, layout, schedule, {"agents": HYPER}, seeds, devices=jax.devices()[:1])
 
 
 def start(trainer):
@@ -89,7 +89,7 @@ def test_replay_is_never_copied_in_the_loop(compiled):
 def test_memory(trainer, compiled):
     """The replay given in is the replay given out (donated), and the program needs far less beside it."""
     memory = compiled.memory_analysis()
-    assert trainer.replay_bytes == 4 * trainer.num_seeds * CAPACITY * trainer.spec.row_size
+    assert trainer.replay_bytes == 4 * trainer.num_seeds * CAPACITY * trainer.layout.row_size
     assert memory.alias_size_in_bytes >= trainer.replay_bytes
     assert memory.temp_size_in_bytes < trainer.replay_bytes / 3
 
@@ -97,7 +97,7 @@ def test_memory(trainer, compiled):
 def test_one_compilation_and_donation(trainer):
     """A chunk is compiled with its first call and never again, though states come from `init`, `prefill` and from
     itself; each state given in is gone after it, in every leaf."""
-    if trainer.num_seeds == 1 or trainer.spec.n_step > 1:
+    if trainer.num_seeds == 1 or trainer.layout.n_step > 1:
         pytest.skip("the same for any number of seeds or steps")
     compiles = []
     jax.monitoring.register_event_duration_secs_listener(

@@ -20,10 +20,10 @@ from ledger import ENDS, HYPER, Ledger, LedgerState, by_hand
 from matd3_jax import config
 from matd3_jax.cli import train
 from matd3_jax.core import q_bias, update
-from matd3_jax.core.agents import Spec
+from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.core.q_bias import Pairs, Values
-from matd3_jax.core.rollout import Policy
+from matd3_jax.core.rollout import PolicyParams
 from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.envs import make
 from matd3_jax.envs.point_reach import PointState
@@ -36,7 +36,7 @@ from matd3_jax.training.schedule import Schedule
 
 MATD3 = Algorithm(hidden=(5,), policy_delay=1)  # or else the loop to compile is twice as long
 IDDPG = Algorithm(name="iddpg", hidden=(6,), num_critics=1, policy_delay=1, critic="own")
-LEDGER = Spec.of(Ledger(), {"agents": MATD3, "adversaries": IDDPG})
+LEDGER = JointLayout.of(Ledger(), {"agents": MATD3, "adversaries": IDDPG})
 GAMMA = (0.9, 0.7)
 LEDGER_HYPER = tuple(HYPER._replace(gamma=gamma) for gamma in GAMMA)
 POINT = make("point_reach", num_agents=2, dim=2, episode_length=3)
@@ -57,8 +57,8 @@ def pairs_of_ledger(number):
 
 
 @functools.cache
-def fresh(spec):
-    return jax.jit(lambda key: update.init(spec, key))(jax.random.key(6))
+def fresh(layout):
+    return jax.jit(lambda key: update.init(layout, key))(jax.random.key(6))
 
 
 def policy_of_ledger(bias):
@@ -68,11 +68,11 @@ def policy_of_ledger(bias):
         actor = jax.tree.map(jnp.zeros_like, group.actor)
         return {**actor, "bias_1": actor["bias_1"] + jnp.array([bias, -bias])}
 
-    return Policy(tuple(map(constant, fresh(LEDGER))), LEDGER_HYPER, None)
+    return PolicyParams(tuple(map(constant, fresh(LEDGER))), LEDGER_HYPER, None)
 
 
-def play_out(env, spec, policy, pairs, steps):
-    play = jax.jit(lambda *args: q_bias.play_out(env, spec, *args, jax.random.key(1), steps))
+def play_out(env, layout, policy, pairs, steps):
+    play = jax.jit(lambda *args: q_bias.play_out(env, layout, *args, jax.random.key(1), steps))
     return np.asarray(play(policy, pairs))
 
 
@@ -120,24 +120,24 @@ def by_numpy(statistics, x):
 
 @functools.cache
 def on_points():
-    """(spec, policy, groups, pairs) of point_reach: own critics, normalised observations, exploration noise."""
+    """(layout, policy, groups, pairs) of point_reach: own critics, normalised observations, exploration noise."""
     rng = np.random.default_rng(3)
-    spec = Spec.of(POINT, {"agents": IDDPG})
-    groups = fresh(spec)
+    layout = JointLayout.of(POINT, {"agents": IDDPG})
+    groups = fresh(layout)
     statistics = Statistics(*(jnp.asarray(rng.uniform(0.1, 0.5, 12), jnp.float32) for _ in range(2)))
     hyper = HYPER._replace(gamma=0.8, exploration_noise=0.5)
     place = [jnp.asarray(rng.uniform(-1, 1, (20, *shape)), jnp.float32) for shape in ((2, 2), (2, 2), (2,), (4,))]
     state = PointState(*place[:3], step=jnp.asarray(rng.integers(0, 3, 20), jnp.int32))
     x = jnp.concatenate(jax.vmap(POINT.observe)(state), axis=-1)
     pairs = Pairs(state, jnp.concatenate([x, place[3]], axis=-1))
-    return spec, Policy(tuple(g.actor for g in groups), (hyper,), statistics), groups, pairs
+    return layout, PolicyParams(tuple(g.actor for g in groups), (hyper,), statistics), groups, pairs
 
 
 def test_true_values_of_box_actions():
     """Damped masses in NumPy, the actors' squashed outputs without noise on normalised observations, six env steps
     though the time limit is three."""
-    spec, policy, groups, pairs = on_points()
-    got = play_out(POINT, spec, policy, pairs, 6)
+    layout, policy, groups, pairs = on_points()
+    got = play_out(POINT, layout, policy, pairs, 6)
     pos, vel, target = (np.asarray(part, np.float64) for part in pairs.state[:3])
     force = np.asarray(pairs.inputs[:, 12:], np.float64).reshape(20, 2, 2)
     value = 0
@@ -172,8 +172,8 @@ def test_estimates_are_the_critics():
 
 
 def test_estimates_read_normalised_observations():
-    spec, policy, groups, pairs = on_points()
-    values = q_bias.measure(POINT, spec, policy, [g.critic for g in groups], pairs, jax.random.key(5), 2)
+    layout, policy, groups, pairs = on_points()
+    values = q_bias.measure(POINT, layout, policy, [g.critic for g in groups], pairs, jax.random.key(5), 2)
     x, action = np.split(np.asarray(pairs.inputs, np.float64), [12], axis=1)
     x = by_numpy(policy.statistics, x)
     for k in range(2):

@@ -11,7 +11,7 @@ import pytest
 from ledger import HYPER, Ledger, by_hand
 
 from matd3_jax.core import n_step, replay, update
-from matd3_jax.core.agents import Spec
+from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.training.loop import Trainer
 from matd3_jax.training.schedule import Schedule
@@ -25,8 +25,8 @@ SCHEDULE = Schedule(num_envs=ENVS, rollout_length=LENGTH, batch_size=8, replay_c
 pytestmark = pytest.mark.usefixtures("quick_jit")
 
 
-def spec(n_step):
-    return Spec.of(Ledger(), {"agents": ALGORITHM, "adversaries": ALGORITHM}, n_step)
+def layout(n_step):
+    return JointLayout.of(Ledger(), {"agents": ALGORITHM, "adversaries": ALGORITHM}, n_step)
 
 
 def test_successors():
@@ -61,14 +61,14 @@ def test_successors_far_on():
 def play(collects):
     """(trainer, state, rows in the order of play [steps, ENVS, row]) of two seeds after so many collects."""
     hyper = {"agents": HYPER._replace(gamma=GAMMAS[0]), "adversaries": HYPER._replace(gamma=GAMMAS[1])}
-    trainer = Trainer(Ledger(), spec(3), SCHEDULE, hyper, 2, devices=jax.devices()[:1])
+    trainer = Trainer(Ledger(), layout(3), SCHEDULE, hyper, 2, devices=jax.devices()[:1])
     state, _ = trainer.prefill(trainer.init(jax.vmap(jax.random.key)(jnp.arange(2))))
     chunk, rows = trainer.chunk(1), [np.asarray(state.replay[:, : 2 * ENVS * LENGTH])]
     while int(state.collects) < collects:
         at = int(state.collects) * ENVS * LENGTH % CAPACITY
         state, _ = chunk(state)
         rows.append(np.asarray(state.replay[:, at : at + ENVS * LENGTH]))
-    played = np.concatenate(rows, axis=1).reshape(2, -1, ENVS, trainer.spec.row_size)
+    played = np.concatenate(rows, axis=1).reshape(2, -1, ENVS, trainer.layout.row_size)
     return trainer, state, played
 
 
@@ -97,7 +97,7 @@ def test_returns_by_python(n, collects):
     @jax.jit
     def drawn(seed, indices):
         written = replay.Written(CAPACITY, SCHEDULE.collect_steps, state.collects)
-        return n_step.draw(spec(n), state.replay, seed, indices, written, ENVS, jnp.array(GAMMAS))
+        return n_step.draw(layout(n), state.replay, seed, indices, written, ENVS, jnp.array(GAMMAS))
 
     oldest = max(0, steps - CAPACITY // ENVS)
     lengths, ends = set(), set()
@@ -121,8 +121,8 @@ def test_returns_by_python(n, collects):
 def test_updates_get_them(monkeypatch):
     """What the loop's updates are given: returns discounted by each agent's own gamma, from all of the replay."""
 
-    def stub(spec, state, hyper, rows, *args, **kwargs):
-        parts = spec.row_parts(rows)
+    def stub(layout, state, hyper, rows, *args, **kwargs):
+        parts = layout.row_parts(rows)
         return state, update.UpdateMetrics(parts.reward.mean(axis=(0, 1)), *2 * [jnp.full(2, parts.more.mean())])
 
     monkeypatch.setattr(update, "update", stub)

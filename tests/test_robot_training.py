@@ -50,8 +50,8 @@ def test_the_ant_trains_and_is_evaluated(physics):
 )
 def test_agents_see_what_their_split_says(overrides, observations, actions):
     training = Training(config.load(["env=ant", *overrides]))
-    assert training.spec.observation_sizes == observations
-    assert tuple(space.size for space in training.spec.action_spaces) == actions
+    assert training.layout.observation_sizes == observations
+    assert tuple(space.size for space in training.layout.action_spaces) == actions
     assert training.team_weights("agents").sum() == 1
 
 

@@ -35,11 +35,11 @@ def trained(name):
 def test_what_is_played_is_what_is_heard(name):
     """Every stored action is valid part by part, and the word in it stands in the listeners' next observation."""
     result, env = trained(name), RUNS[name][0]
-    spec, written = result.training.spec, 10 * int(result.state.collects)
+    layout, written = result.training.layout, 10 * int(result.state.collects)
     assert 60 <= written <= SMALL["replay_capacity"]
-    parts = spec.row_parts(np.asarray(result.state.replay)[0, :written])
-    for i, space in enumerate(spec.action_spaces):
-        action, start = spec.action_part(parts.action, i), 0
+    parts = layout.row_parts(np.asarray(result.state.replay)[0, :written])
+    for i, space in enumerate(layout.action_spaces):
+        action, start = layout.action_part(parts.action, i), 0
         for size in space.sizes:
             part = action[:, start : start + size]
             np.testing.assert_allclose(part.sum(axis=1), 1, atol=1e-6)  # float32 softmax
@@ -48,9 +48,9 @@ def test_what_is_played_is_what_is_heard(name):
             start += size
         assert start == action.shape[1]
     for speaker, listeners in HEARD[env].items():
-        word = spec.action_part(parts.action, speaker)[:, 5:]
+        word = layout.action_part(parts.action, speaker)[:, 5:]
         for listener in listeners:
-            np.testing.assert_array_equal(spec.observation_part(parts.next_x, listener)[:, -word.shape[1] :], word)
+            np.testing.assert_array_equal(layout.observation_part(parts.next_x, listener)[:, -word.shape[1] :], word)
 
 
 @pytest.mark.parametrize("name", RUNS)
@@ -59,7 +59,7 @@ def test_the_word_is_learnt_too(name):
     result = trained(name)
     training = result.training
     before, _ = training.start()
-    for g, group in enumerate(training.spec.groups):
+    for g, group in enumerate(training.layout.groups):
         old, new = (
             np.asarray(state.groups[g].actor[f"kernel_{len(group.algorithm.hidden)}"])
             for state in (before, result.state)
@@ -77,7 +77,7 @@ def test_deterministic_words(name):
     states = trajectory.play(training, result.state, max_steps=3).states
     seen = jax.vmap(training.env.observe)(states)
     for speaker in HEARD[env]:
-        g, k = training.spec.place(speaker)
+        g, k = training.layout.place(speaker)
         logits, _ = reference.forward(layers(result.state.groups[g].actor, 0, k), np.asarray(seen[speaker][:-1]))
         want = reference.softmax(logits[:, 5:])
         if actions == "discrete":

@@ -11,7 +11,7 @@ import pytest
 from ledger import ENDS, HYPER, LIMIT, Ledger, by_hand
 
 from matd3_jax.core import rollout, update
-from matd3_jax.core.agents import Spec
+from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.training.loop import Trainer
 from matd3_jax.training.schedule import Schedule
@@ -34,7 +34,7 @@ def make(seeds, schedule=SCHEDULE, delays=(2, 1), env=None, tau=0.1, **options):
     # A learning rate for each seed: seeds must not mix up their hyper-parameters.
     rates = np.array([0.01, 0.02, 0.03])[seeds]
     hyper = {team: HYPER._replace(critic_lr=rates, tau=tau) for team in env.teams}
-    return Trainer(env, Spec.of(env, algorithms), schedule, hyper, len(seeds), **options)
+    return Trainer(env, JointLayout.of(env, algorithms), schedule, hyper, len(seeds), **options)
 
 
 def start(trainer, seeds):
@@ -169,7 +169,7 @@ def stub(log):
     """In `update.update`'s place: writes into the actors a binary number of the moves so far (first bit a 1), and the
     number of different transitions and of empty rows in the minibatches into the metrics."""
 
-    def replaced(spec, state, hyper, rows, key, move, *args, **kwargs):
+    def replaced(layout, state, hyper, rows, key, move, *args, **kwargs):
         log.append(rows.shape)
         state = tuple(
             s._replace(actor=jax.tree.map(lambda leaf, m=m: 2 * leaf + m, s.actor))
@@ -178,7 +178,7 @@ def stub(log):
         name = jnp.sort((rows[..., 0] + rows[..., 1]).ravel())  # number of the episode + step
         different, empty = 1.0 + (jnp.diff(name) > 0).sum(), (rows[..., 0] == 0).sum()
         own = jnp.mean(rows[0] != rows[-1])
-        return state, update.UpdateMetrics(*(jnp.full(spec.num_agents, v) for v in (different, empty, own)))
+        return state, update.UpdateMetrics(*(jnp.full(layout.num_agents, v) for v in (different, empty, own)))
 
     return replaced
 
@@ -197,9 +197,9 @@ def stubbed_run(monkeypatch, trainer, state, cycles):
 def moves(monkeypatch, delays, updates):
     """(bits of two cycles, expected bits): nothing is played, only the schedule counts."""
 
-    def stay(env, spec, policy, env_state, key, length, **options):
-        rows = jnp.zeros((length * env_state.episode_step.shape[0], spec.row_size))
-        return env_state, rows, rollout.Episodes(jnp.int32(0), jnp.zeros(spec.num_agents), jnp.int32(0)), None
+    def stay(env, layout, policy, env_state, key, length, **options):
+        rows = jnp.zeros((length * env_state.episode_step.shape[0], layout.row_size))
+        return env_state, rows, rollout.Episodes(jnp.int32(0), jnp.zeros(layout.num_agents), jnp.int32(0)), None
 
     monkeypatch.setattr(rollout, "collect", stay)
     trainer = make([0], dataclasses.replace(SCHEDULE, updates_per_collect=updates), delays)

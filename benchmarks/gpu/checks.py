@@ -54,13 +54,13 @@ def update_error(precision: str | None) -> Row:
     over all weights of all critics. (Adam's first step is about lr in the direction of each gradient's sign, which
     rounding may turn round where a gradient is next to 0: the largest difference would say little.)"""
     training = Training(config.load(["seeds=1", "total_steps=100000"]))
-    spec, hyper = training.spec, [training.config.algo.hyper_params()]
+    layout, hyper = training.layout, [training.config.algo.hyper_params()]
     before, after = [], []
     for device, kind in ((jax.devices()[0], precision), (jax.devices("cpu")[0], "highest")):
         with jax.default_device(device), jax.default_matmul_precision(kind):
-            state = update.init(spec, jax.random.key(0))
-            rows = jax.random.normal(jax.random.key(1), (spec.num_agents, 1024, spec.row_size)) * 0.3
-            program = jax.jit(lambda s, r: update.update(spec, s, hyper, r, jax.random.key(2), [True])[0])
+            state = update.init(layout, jax.random.key(0))
+            rows = jax.random.normal(jax.random.key(1), (layout.num_agents, 1024, layout.row_size)) * 0.3
+            program = jax.jit(lambda s, r: update.update(layout, s, hyper, r, jax.random.key(2), [True])[0])
             before.append(_flat(state[0].critic))
             after.append(_flat(program(state, rows)[0].critic))
     length = np.linalg.norm(after[1] - before[1])
@@ -76,7 +76,7 @@ def replay_copies() -> int:
     """Copies of the whole replay in the optimised program of a chunk."""
     trainer = Training(config.load(["seeds=4", "total_steps=100000"])).trainer
     state = trainer.abstract_state()
-    shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.spec.row_size)
+    shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.layout.row_size)
     state = state._replace(replay=jax.ShapeDtypeStruct(shape, jnp.float32))
     text = trainer.chunk(3).jitted.lower(state, trainer.hyper).compile().as_text()
     return copies_in(text, trainer)

@@ -54,7 +54,7 @@ def fitting(trainer: Trainer, budget: float, most: int) -> int:
     updated together leave. Raises ValueError where not even a minibatch fits."""
     together = trainer.mesh.size if trainer.on_cpu else trainer.rows
     beside = trainer.rows * memory.seed_bytes(trainer) + together * memory.update_bytes(trainer)
-    rows = int((budget - beside) // (4 * trainer.rows * trainer.spec.row_size))
+    rows = int((budget - beside) // (4 * trainer.rows * trainer.layout.row_size))
     collect = trainer.schedule.collect_steps
     capacity = min(rows, most) // collect * collect
     if capacity < trainer.schedule.batch_size:

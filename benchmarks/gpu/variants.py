@@ -116,10 +116,10 @@ def draw(overrides: list[str], large: bool, seconds: float, context: Callable[[]
 def drawn(training: Training) -> Sequence[int]:
     """How many numbers each draw of one seed's cycle holds: those of each update (minibatches, target actions for every
     agent, own actions) and of each collect."""
-    spec, schedule, trainer = training.spec, training.trainer.schedule, training.trainer
-    batch, agents = schedule.batch_size, spec.num_agents
-    update = [agents * batch, agents * batch * spec.action_size, batch * spec.action_size]
+    layout, schedule, trainer = training.layout, training.trainer.schedule, training.trainer
+    batch, agents = schedule.batch_size, layout.num_agents
+    update = [agents * batch, agents * batch * layout.action_size, batch * layout.action_size]
     return trainer.cycle_collects * [
         *schedule.updates_per_collect * update,
-        schedule.collect_steps * spec.action_size,
+        schedule.collect_steps * layout.action_size,
     ]

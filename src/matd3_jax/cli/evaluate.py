@@ -74,9 +74,9 @@ def _online(state: TrainState) -> TrainState:
 
 def _quantities(training: Training, found: Evaluation) -> list[tuple[str, np.ndarray]]:
     """(name, values [seeds, episodes]): returns by team and agent, length, measures; names as in the metrics table."""
-    spec, returns = training.spec, np.asarray(found.episode_return)
-    teams = [(f"return_{team}", returns @ training.team_weights(team)) for team in dict.fromkeys(spec.teams)]
-    agents = [(f"{agent}_return", returns[:, :, i]) for i, agent in enumerate(spec.agents)]
+    layout, returns = training.layout, np.asarray(found.episode_return)
+    teams = [(f"return_{team}", returns @ training.team_weights(team)) for team in dict.fromkeys(layout.teams)]
+    agents = [(f"{agent}_return", returns[:, :, i]) for i, agent in enumerate(layout.agents)]
     measures = [(name, np.asarray(found.measures)[:, :, k]) for k, name in enumerate(training.env.measures)]
     return [*teams, *agents, ("episode_length", np.asarray(found.length)), *measures]
 

@@ -143,7 +143,7 @@ def _advance(training: Training, run: RunDirectory, state: TrainState, row: Row,
     metrics = run.read_metrics()
     learning_curves.learning_curve(run.curve, metrics, _title(training))
     if settings.diagnostics.q_bias:
-        q_bias.draw(run.q_bias, metrics, training.spec.by_team(), _title(training))
+        q_bias.draw(run.q_bias, metrics, training.layout.by_team(), _title(training))
     if stopped is not None and step < training.total_steps:
         print(f"stopped by {stopped.name} at env step {step:,}; go on with: "
               f"python -m matd3_jax.train resume={run.path}")  # fmt: skip
@@ -157,8 +157,8 @@ def _advance(training: Training, run: RunDirectory, state: TrainState, row: Row,
         for name in (name for name in row if name.startswith("eval_")):
             print(f"  {name.removeprefix('eval_')}: {summary.text(summary.final(row[name]), over)}")
     if settings.diagnostics.q_bias:
-        facts["overestimation"] = overestimation.summary(metrics, training.spec.agents)
-        for line in overestimation.lines(metrics, training.spec.agents, settings.diagnostics.q_bias_rollouts):
+        facts["overestimation"] = overestimation.summary(metrics, training.layout.agents)
+        for line in overestimation.lines(metrics, training.layout.agents, settings.diagnostics.q_bias_rollouts):
             print(line)
         print(f"estimated and true values: {run.q_bias}")
     run.write_summary(facts)
@@ -202,7 +202,7 @@ def _robot_lines(training: Training) -> list[str]:
 
 
 def _title(training: Training) -> str:
-    teams = dict.fromkeys(training.spec.teams)
+    teams = dict.fromkeys(training.layout.teams)
     names = [f"{training.config.teams()[team].name}" for team in teams]
     return f"{training.config.env['name']}: " + " against ".join(dict.fromkeys(names))
 

@@ -48,7 +48,7 @@ class Group:
 
 
 @dataclasses.dataclass(frozen=True)
-class Spec:
+class JointLayout:
     """Who learns, and the layout of joint vectors.
 
     The joint observation x [observation_size] and the joint action [action_size] hold the agents' parts in the order
@@ -66,8 +66,8 @@ class Spec:
     """Rewards in a target before it bootstraps (see `returns`)."""
 
     @classmethod
-    def of(cls, env: Environment, algorithms: Mapping[str, Algorithm], n_step: int = 1) -> "Spec":
-        """The spec of `env` with the algorithm of each team given by name."""
+    def of(cls, env: Environment, algorithms: Mapping[str, Algorithm], n_step: int = 1) -> "JointLayout":
+        """The joint layout of `env` with the algorithm of each team given by name."""
         return cls(
             agents=env.agents,
             teams=env.teams,

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import chex
 import jax.numpy as jnp
 
-from matd3_jax.core.agents import Group, Spec
+from matd3_jax.core.agents import Group, JointLayout
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.minibatch import Minibatch, Noise
 from matd3_jax.core.networks import apply
@@ -30,7 +30,7 @@ def td_target(
 
 
 def target_actions(
-    spec: Spec,
+    layout: JointLayout,
     group: Group,
     hyper: HyperParams,
     mu_targets: Sequence[chex.ArrayTree],
@@ -42,7 +42,7 @@ def target_actions(
     agent: [batch, action size], of all agents for central critics, else of the agent itself."""
     central = group.algorithm.critic == "central"
     if central:
-        others = [(other, params, other.actors) for other, params in zip(spec.groups, mu_targets, strict=True)]
+        others = [(other, params, other.actors) for other, params in zip(layout.groups, mu_targets, strict=True)]
     else:
         others = [(group, own_target, group.actor)]
     parts = []
@@ -52,7 +52,7 @@ def target_actions(
         if draw is not None:
             part = other.policy.smooth(part, draw, hyper.target_noise, hyper.target_noise_clip)
         parts.append(part)
-    return spec.join_actions(parts) if central else parts[0]
+    return layout.join_actions(parts) if central else parts[0]
 
 
 def critic_loss(

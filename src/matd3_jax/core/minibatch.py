@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from matd3_jax.core.agents import Group, Spec
+from matd3_jax.core.agents import Group, JointLayout
 from matd3_jax.core.policies import Policy, flat_draw
 
 
@@ -54,16 +54,18 @@ class Noise(NamedTuple):
     """[batch, action size] of the own new action."""
 
 
-def places(spec: Spec, group: Group) -> Place:
+def places(layout: JointLayout, group: Group) -> Place:
     """Of all members, leaves [members]."""
     members = np.array(group.members)
-    return Place(members, np.array(spec.observation_starts)[members], np.array(spec.action_starts)[members])
+    return Place(members, np.array(layout.observation_starts)[members], np.array(layout.action_starts)[members])
 
 
-def minibatch(spec: Spec, group: Group, rows: chex.Array, place: Place, gamma: chex.Array | float) -> Minibatch:
+def minibatch(
+    layout: JointLayout, group: Group, rows: chex.Array, place: Place, gamma: chex.Array | float
+) -> Minibatch:
     """The minibatch of one member from its rows [batch, row_size]."""
     central = group.algorithm.critic == "central"
-    parts = spec.row_parts(rows)
+    parts = layout.row_parts(rows)
 
     def part(whole: chex.Array, start: chex.Array, size: int) -> chex.Array:
         return jax.lax.dynamic_slice_in_dim(whole, start, size, axis=-1)
@@ -72,7 +74,7 @@ def minibatch(spec: Spec, group: Group, rows: chex.Array, place: Place, gamma: c
     action = part(parts.action, place.action, group.action_space.size)
     own_next = part(parts.next_x, place.observation, group.observation_size)
     every_next = tuple(
-        jnp.stack([spec.observation_part(parts.next_x, j) for j in other.members]) for other in spec.groups
+        jnp.stack([layout.observation_part(parts.next_x, j) for j in other.members]) for other in layout.groups
     )
     return Minibatch(
         observation=observation,
@@ -82,11 +84,11 @@ def minibatch(spec: Spec, group: Group, rows: chex.Array, place: Place, gamma: c
         discount=parts.discount if parts.more is None else parts.discount * gamma**parts.more,
         next_observations=every_next if central else (own_next,),
         next_x=parts.next_x if central else own_next,
-        action_column=spec.observation_size + place.action if central else group.observation_size,
+        action_column=layout.observation_size + place.action if central else group.observation_size,
     )
 
 
-def draw_noise(spec: Spec, group: Group, shape: tuple[int, int], key: chex.PRNGKey, axis: str | None) -> Noise:
+def draw_noise(layout: JointLayout, group: Group, shape: tuple[int, int], key: chex.PRNGKey, axis: str | None) -> Noise:
     """The random numbers of a group's members; `shape`: minibatches (1: shared) and their size, on each device of
     `axis` (which draws those of the whole minibatch, as one device would, and takes its own)."""
     batches, local = shape
@@ -95,7 +97,7 @@ def draw_noise(spec: Spec, group: Group, shape: tuple[int, int], key: chex.PRNGK
     action_key, target_key, smooth_key = jax.random.split(key, 3)
     wanted: list[tuple[Policy, tuple[int, ...]]]
     if group.algorithm.critic == "central":
-        wanted = [(other.policy, (len(other.members), size)) for other in spec.groups]
+        wanted = [(other.policy, (len(other.members), size)) for other in layout.groups]
     else:
         wanted, batches = [(group.policy, (size,))], members  # nobody shares an own action
 

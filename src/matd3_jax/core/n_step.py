@@ -11,11 +11,11 @@ import chex
 import jax.numpy as jnp
 
 from matd3_jax.core import replay
-from matd3_jax.core.agents import Spec
+from matd3_jax.core.agents import JointLayout
 
 
 def draw(
-    spec: Spec,
+    layout: JointLayout,
     rows: chex.Array,
     seed: chex.Array | int,
     indices: chex.Array,
@@ -32,18 +32,18 @@ def draw(
         rows: the replay [seeds, capacity, row_size].
         gamma: of each agent, [num_agents].
     """
-    numbers, there = replay.successors(written, indices, num_envs, spec.n_step)
-    start = spec.observation_size + spec.action_size
-    end = start + spec.num_agents
+    numbers, there = replay.successors(written, indices, num_envs, layout.n_step)
+    start = layout.observation_size + layout.action_size
+    end = start + layout.num_agents
     # Of the rows after the first only these few numbers, and x' of the last: whole rows took as long as the update.
     found = replay.gather(rows, seed, numbers, slice(start, end + 1))
     reward, more = found[..., :-1], found[..., -1] > 0
     follow = jnp.cumprod(more[..., :-1] & there[..., 1:], axis=-1, dtype=jnp.int32)
     counts = jnp.concatenate([jnp.ones_like(follow[..., :1]), follow], axis=-1)
-    powers = gamma ** jnp.arange(spec.n_step)[:, None]
+    powers = gamma ** jnp.arange(layout.n_step)[:, None]
     total = jnp.where(counts[..., None] > 0, powers * reward, 0).sum(axis=-2)
     steps = follow.sum(axis=-1)
     last = jnp.take_along_axis(numbers, steps[..., None], axis=-1)[..., 0]
     first = replay.gather(rows, seed, indices, slice(0, start))
-    ending = replay.gather(rows, seed, last, slice(end + 1, spec.row_size))
+    ending = replay.gather(rows, seed, last, slice(end + 1, layout.row_size))
     return jnp.concatenate([first, total, steps[..., None], ending], axis=-1, dtype=rows.dtype)

@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from matd3_jax.core import rollout, running_statistics
-from matd3_jax.core.agents import Spec
-from matd3_jax.core.rollout import Policy
+from matd3_jax.core.agents import JointLayout
+from matd3_jax.core.rollout import PolicyParams
 from matd3_jax.envs.environment import Environment
 
 
@@ -44,10 +44,10 @@ class Values(NamedTuple):
     """Discounted sum of the agent's rewards, from the state and the action on."""
 
 
-def allocate(state: Any, size: int, spec: Spec) -> Pairs:
+def allocate(state: Any, size: int, layout: JointLayout) -> Pairs:
     """`size` pairs that hold nothing yet. state: of one seed's environments, leading axis [num_envs]."""
     states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:1], (size, *leaf.shape[1:])), state)
-    return Pairs(states, jnp.zeros((size, spec.observation_size + spec.action_size)))
+    return Pairs(states, jnp.zeros((size, layout.observation_size + layout.action_size)))
 
 
 def keep(pairs: Pairs, new: Pairs, share: chex.Array, key: chex.PRNGKey) -> Pairs:
@@ -70,61 +70,65 @@ def keep(pairs: Pairs, new: Pairs, share: chex.Array, key: chex.PRNGKey) -> Pair
 
 def measure(
     env: Environment,
-    spec: Spec,
-    policy: Policy,
+    layout: JointLayout,
+    policy: PolicyParams,
     critics: Sequence[chex.ArrayTree],
     pairs: Pairs,
     key: chex.PRNGKey,
     steps: int,
 ) -> Values:
     """What the critics (parameters, one stack per group) say of the pairs, and the true values (see `play_out`)."""
-    return Values(estimate(spec, policy, critics, pairs.inputs), play_out(env, spec, policy, pairs, key, steps))
+    return Values(estimate(layout, policy, critics, pairs.inputs), play_out(env, layout, policy, pairs, key, steps))
 
 
-def estimate(spec: Spec, policy: Policy, critics: Sequence[chex.ArrayTree], inputs: chex.Array) -> chex.Array:
+def estimate(
+    layout: JointLayout, policy: PolicyParams, critics: Sequence[chex.ArrayTree], inputs: chex.Array
+) -> chex.Array:
     """Q_i(x, a) of every agent, mean over its critics, in the units of its rewards: [pairs, num_agents]."""
-    x, action = jnp.split(inputs, [spec.observation_size], axis=-1)
+    x, action = jnp.split(inputs, [layout.observation_size], axis=-1)
     if policy.statistics is not None:
         x = running_statistics.normalise(policy.statistics, x)
-    values: list[Any] = [None] * spec.num_agents
-    for group, params in zip(spec.groups, critics, strict=True):
+    values: list[Any] = [None] * layout.num_agents
+    for group, params in zip(layout.groups, critics, strict=True):
         for k, i in enumerate(group.members):
             parts = [x, action]
             if group.algorithm.critic == "own":
-                parts = [spec.observation_part(x, i), spec.action_part(action, i)]
+                parts = [layout.observation_part(x, i), layout.action_part(action, i)]
             own = jax.tree.map(lambda leaf, k=k: leaf[k], params)
             value = group.critic.values(own, jnp.concatenate(parts, axis=-1)).mean(axis=0)
             values[i] = value / group.algorithm.reward_scale
     return jnp.stack(values, axis=-1)
 
 
-def play_out(env: Environment, spec: Spec, policy: Policy, pairs: Pairs, key: chex.PRNGKey, steps: int) -> chex.Array:
+def play_out(
+    env: Environment, layout: JointLayout, policy: PolicyParams, pairs: Pairs, key: chex.PRNGKey, steps: int
+) -> chex.Array:
     """Discounted sum of each agent's rewards over `steps` env steps, [pairs, num_agents]: one rollout from each pair.
 
     First the stored action, then the policies that the critics' targets mean: choices sampled, Box actions without
     noise. Termination ends a rollout; a time limit does not, as targets bootstrap through it. Each agent's rewards are
     discounted with the gamma of its team.
     """
-    _, action = jnp.split(pairs.inputs, [spec.observation_size], axis=-1)
+    _, action = jnp.split(pairs.inputs, [layout.observation_size], axis=-1)
     number = action.shape[0]
     step_key, noise_key = jax.random.split(key)
-    gamma = jnp.stack([jnp.asarray(policy.hyper[spec.place(i)[0]].gamma) for i in range(spec.num_agents)])
+    gamma = jnp.stack([jnp.asarray(policy.hyper[layout.place(i)[0]].gamma) for i in range(layout.num_agents)])
     # All noise in one draw for each group, not one for each step; None for a Box.
     noise = tuple(
         group.policy.own_noise(jax.random.fold_in(noise_key, g), (steps, len(group.members), number))
-        for g, group in enumerate(spec.groups)
+        for g, group in enumerate(layout.groups)
     )
 
     def step(carry, inputs):
         state, action, going, discount, total = carry
         draws, keys = inputs
-        after = jax.vmap(env.step)(keys, state, rollout.env_actions(spec, action))
+        after = jax.vmap(env.step)(keys, state, rollout.env_actions(layout, action))
         total += jnp.where(going[:, None], discount * after.reward, 0)
-        action = rollout.act(spec, policy, after.observation, draws)
+        action = rollout.act(layout, policy, after.observation, draws)
         return (after.state, action, going & ~after.terminated, discount * gamma, total), None
 
     carry = (
-        pairs.state, action, jnp.ones(number, bool), jnp.ones(spec.num_agents), jnp.zeros((number, spec.num_agents))
+        pairs.state, action, jnp.ones(number, bool), jnp.ones(layout.num_agents), jnp.zeros((number, layout.num_agents))
     )  # fmt: skip
     (*_, total), _ = jax.lax.scan(step, carry, (noise, jax.random.split(step_key, (steps, number))))
     return total

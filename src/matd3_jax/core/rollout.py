@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from matd3_jax.core import networks, running_statistics
-from matd3_jax.core.agents import Spec
+from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.envs.environment import Environment
@@ -18,7 +18,7 @@ APART = 2**31 - 1
 """Folded into a key whose `split` and other `fold_in` never get that far."""
 
 
-class Policy(NamedTuple):
+class PolicyParams(NamedTuple):
     """All that acting takes, of one seed."""
 
     actors: tuple[chex.ArrayTree, ...]
@@ -71,15 +71,15 @@ def start(env: Environment, key: chex.PRNGKey, num_envs: int, noise_range: bool 
     return EnvState(state, observation, jnp.zeros(shape), jnp.zeros(num_envs, jnp.int32), quantile)
 
 
-def ranged(spec: Spec) -> bool:
+def ranged(layout: JointLayout) -> bool:
     """Whether an agent's exploration noise is drawn from a range."""
-    return any(algorithm.noise_range for algorithm in spec.algorithms)
+    return any(algorithm.noise_range for algorithm in layout.algorithms)
 
 
 def collect(
     env: Environment,
-    spec: Spec,
-    policy: Policy,
+    layout: JointLayout,
+    policy: PolicyParams,
     env_state: EnvState,
     key: chex.PRNGKey,
     length: int,
@@ -98,16 +98,16 @@ def collect(
     num_envs = env_state.episode_step.shape[0]
     noise_key, step_key, reset_key = jax.random.split(key, 3)
     # All noise of the stretch in one draw for each group, not one for each step.
-    noise = _noise(spec, noise_key, (length, num_envs), random)
+    noise = _noise(layout, noise_key, (length, num_envs), random)
 
     def step(carry: EnvState, inputs):
         draws, step_keys, fresh, fresh_quantile = inputs
         before = carry.state if keep_states else None
         quantile = 0.5 if carry.noise_quantile is None else carry.noise_quantile
-        action = spec.join_actions(draws) if random else act(spec, policy, carry.observation, draws, quantile)
-        after = jax.vmap(env.step)(step_keys, carry.state, env_actions(spec, action))
+        action = layout.join_actions(draws) if random else act(layout, policy, carry.observation, draws, quantile)
+        after = jax.vmap(env.step)(step_keys, carry.state, env_actions(layout, action))
         x, next_x = (jnp.concatenate(o, axis=-1) for o in (carry.observation, after.observation))
-        rows = spec.pack_rows(x, action, after.reward, next_x, after.terminated, after.truncated)
+        rows = layout.pack_rows(x, action, after.reward, next_x, after.terminated, after.truncated)
         returns = carry.episode_return + after.reward
         steps = carry.episode_step + 1
         ended = after.terminated | after.truncated
@@ -138,8 +138,8 @@ def collect(
 
 def evaluate(
     env: Environment,
-    spec: Spec,
-    policy: Policy,
+    layout: JointLayout,
+    policy: PolicyParams,
     key: chex.PRNGKey,
     episodes: int,
     deterministic: bool,
@@ -151,7 +151,7 @@ def evaluate(
     """
 
     def choose(key, state, observation):
-        return decide(spec, policy, observation, None if deterministic else key)
+        return decide(layout, policy, observation, None if deterministic else key)
 
     return play(env, choose, key, episodes)
 
@@ -190,17 +190,17 @@ def play(env: Environment, choose: Callable, key: chex.PRNGKey, episodes: int) -
 
 
 def decide(
-    spec: Spec, policy: Policy, observation: Sequence[chex.Array], key: chex.PRNGKey | None
+    layout: JointLayout, policy: PolicyParams, observation: Sequence[chex.Array], key: chex.PRNGKey | None
 ) -> tuple[chex.Array, ...]:
     """What each agent does, as `Environment.step` takes it with a leading axis [envs], for one observation
     [envs, size] per agent. key: of the noise; None: deterministic actions."""
-    draws = None if key is None else _noise(spec, key, observation[0].shape[:1])
-    return env_actions(spec, act(spec, policy, observation, draws))
+    draws = None if key is None else _noise(layout, key, observation[0].shape[:1])
+    return env_actions(layout, act(layout, policy, observation, draws))
 
 
 def act(
-    spec: Spec,
-    policy: Policy,
+    layout: JointLayout,
+    policy: PolicyParams,
     observation: Sequence[chex.Array],
     draws: Sequence[chex.Array | None] | None,
     noise_quantile: chex.Array | float = 0.5,
@@ -215,30 +215,32 @@ def act(
     """
     parts, statistics = [], policy.statistics
     if statistics is not None:
-        observation = [running_statistics.normalise_part(spec, statistics, o, i) for i, o in enumerate(observation)]
-    for g, group in enumerate(spec.groups):
+        observation = [running_statistics.normalise_part(layout, statistics, o, i) for i, o in enumerate(observation)]
+    for g, group in enumerate(layout.groups):
         stacked = jnp.stack([observation[i] for i in group.members])
         output = networks.apply(group.actors, policy.actors[g], stacked)
         draw = None if draws is None else draws[g]
         scale = policy.hyper[g].exploration_noise
         if group.algorithm.noise_range:
-            quantile = jnp.broadcast_to(noise_quantile, (stacked.shape[1], spec.num_agents))
+            quantile = jnp.broadcast_to(noise_quantile, (stacked.shape[1], layout.num_agents))
             own = quantile[:, np.array(group.members)].T[..., None]
             scale = scale + own * (policy.hyper[g].exploration_noise_high - scale)
         parts.append(group.policy.sample(output, draw, scale))
-    return spec.join_actions(parts)
+    return layout.join_actions(parts)
 
 
-def env_actions(spec: Spec, action: chex.Array) -> tuple[chex.Array, ...]:
+def env_actions(layout: JointLayout, action: chex.Array) -> tuple[chex.Array, ...]:
     """What `Environment.step` takes, of joint action vectors [..., action_size]."""
-    return tuple(spec.policy(i).to_env(spec.action_part(action, i)) for i in range(spec.num_agents))
+    return tuple(layout.policy(i).to_env(layout.action_part(action, i)) for i in range(layout.num_agents))
 
 
-def _noise(spec: Spec, key: chex.PRNGKey, shape: tuple[int, ...], random: bool = False) -> tuple[chex.Array, ...]:
+def _noise(
+    layout: JointLayout, key: chex.PRNGKey, shape: tuple[int, ...], random: bool = False
+) -> tuple[chex.Array, ...]:
     """Noise [*shape[:-1], members, shape[-1], action size] of every group; `random`: whole random actions instead."""
     return tuple(
         (group.policy.random if random else group.policy.noise)(
             jax.random.fold_in(key, g), (*shape[:-1], len(group.members), shape[-1])
         )
-        for g, group in enumerate(spec.groups)
+        for g, group in enumerate(layout.groups)
     )

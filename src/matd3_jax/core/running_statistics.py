@@ -5,7 +5,7 @@ from typing import NamedTuple
 import chex
 import jax.numpy as jnp
 
-from matd3_jax.core.agents import Spec
+from matd3_jax.core.agents import JointLayout
 
 CLIP = 10.0
 """Bound of normalised entries: one that hardly ever moves must not flood a network when it does."""
@@ -54,13 +54,13 @@ def normalise(statistics: Statistics, x: chex.Array) -> chex.Array:
     return jnp.clip(scaled, -CLIP, CLIP)
 
 
-def normalise_part(spec: Spec, statistics: Statistics, observation: chex.Array, agent: int) -> chex.Array:
+def normalise_part(layout: JointLayout, statistics: Statistics, observation: chex.Array, agent: int) -> chex.Array:
     """The same of one agent's observations o_i [..., observation_sizes[agent]]."""
-    return normalise(Statistics(*(spec.observation_part(part, agent) for part in statistics)), observation)
+    return normalise(Statistics(*(layout.observation_part(part, agent) for part in statistics)), observation)
 
 
-def normalise_rows(spec: Spec, statistics: Statistics, rows: chex.Array) -> chex.Array:
+def normalise_rows(layout: JointLayout, statistics: Statistics, rows: chex.Array) -> chex.Array:
     """The same of x and x' in replay rows [..., row_size]."""
-    for columns in spec.observation_columns:
+    for columns in layout.observation_columns:
         rows = rows.at[..., columns].set(normalise(statistics, rows[..., columns]))
     return rows

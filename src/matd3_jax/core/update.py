@@ -10,7 +10,7 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from matd3_jax.core import losses, minibatch, networks, optimizer
-from matd3_jax.core.agents import Group, Spec
+from matd3_jax.core.agents import Group, JointLayout
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.minibatch import Minibatch, Noise, Place
 
@@ -42,18 +42,18 @@ class UpdateMetrics(NamedTuple):
     """NaN where this update left the actor alone."""
 
 
-def critic_input_size(spec: Spec, group: Group) -> int:
+def critic_input_size(layout: JointLayout, group: Group) -> int:
     if group.algorithm.critic == "central":
-        return spec.observation_size + spec.action_size
+        return layout.observation_size + layout.action_size
     return group.observation_size + group.action_space.size
 
 
-def init(spec: Spec, key: chex.PRNGKey) -> tuple[GroupState, ...]:
+def init(layout: JointLayout, key: chex.PRNGKey) -> tuple[GroupState, ...]:
     """Fresh networks and optimisers of all groups."""
 
     def one(group: Group, key: chex.PRNGKey) -> GroupState:
         algorithm, keys = group.algorithm, jax.random.split(key, 4)
-        observation, inputs = jnp.zeros((1, group.observation_size)), critic_input_size(spec, group)
+        observation, inputs = jnp.zeros((1, group.observation_size)), critic_input_size(layout, group)
         mu, q = group.actor.init(keys[0], observation)["params"], group.critic.init(keys[1], inputs)
         if algorithm.sync_targets:
             # Copies, not the same arrays: the state is donated, and one buffer can't be given away twice.
@@ -65,15 +65,15 @@ def init(spec: Spec, key: chex.PRNGKey) -> tuple[GroupState, ...]:
         average = jax.tree.map(jnp.copy, mu) if algorithm.actor_average else None
         return GroupState(mu, q, mu_target, q_target, adam.init(mu), adam.init(q), average)
 
-    keys = jax.random.split(key, spec.num_agents)
+    keys = jax.random.split(key, layout.num_agents)
     return tuple(
         jax.vmap(lambda k, group=group: one(group, k))(keys[jnp.array(group.members)])  # type: ignore[misc]
-        for group in spec.groups
+        for group in layout.groups
     )
 
 
 def update(
-    spec: Spec,
+    layout: JointLayout,
     state: tuple[GroupState, ...],
     hyper: Sequence[HyperParams],
     rows: chex.Array,
@@ -98,22 +98,23 @@ def update(
             first rows on the first device), gradients are averaged over all. None: one device has the whole.
     """
     mu_targets = [group.actor_target for group in state]
-    keys = jax.random.split(key, len(spec.groups))
-    places = [minibatch.places(spec, group) for group in spec.groups]
+    keys = jax.random.split(key, len(layout.groups))
+    places = [minibatch.places(layout, group) for group in layout.groups]
     noises = [
-        minibatch.draw_noise(spec, group, rows.shape[:2], k, axis) for group, k in zip(spec.groups, keys, strict=True)
+        minibatch.draw_noise(layout, group, rows.shape[:2], k, axis)
+        for group, k in zip(layout.groups, keys, strict=True)
     ]
-    new, metrics = list(state), jnp.full((3, spec.num_agents), jnp.nan)
+    new, metrics = list(state), jnp.full((3, layout.num_agents), jnp.nan)
 
     def cut(g: int, place: Place) -> Minibatch:
         own = rows[0] if rows.shape[0] == 1 else jax.lax.dynamic_index_in_dim(rows, place.agent, keepdims=False)
-        return minibatch.minibatch(spec, spec.groups[g], own, place, hyper[g].gamma)
+        return minibatch.minibatch(layout, layout.groups[g], own, place, hyper[g].gamma)
 
     def minibatches(g: int) -> Place | Minibatch:
         """Of all members, stacked; one by one each is cut out in its turn, as all N together hold N times N parts."""
         if one_by_one:
             return places[g]
-        members = range(len(spec.groups[g].members))
+        members = range(len(layout.groups[g].members))
         return jax.tree.map(
             lambda *m: jnp.stack(m), *(cut(g, jax.tree.map(lambda p, k=k: p[k], places[g])) for k in members)
         )
@@ -123,28 +124,28 @@ def update(
             state, own_target, batch, noise = args
             batch = cut(g, batch) if one_by_one else batch
             return _update_agent(
-                spec, spec.groups[g], hyper[g], move[g], axis, targets, state, own_target, batch, noise, next_action
+                layout, layout.groups[g], hyper[g], move[g], axis, targets, state, own_target, batch, noise, next_action
             )
 
         return f
 
     if sequential:
-        for i in range(spec.num_agents):
-            g, k = spec.place(i)
+        for i in range(layout.num_agents):
+            g, k = layout.place(i)
             args = jax.tree.map(lambda leaf, k=k: leaf[k], (state[g], mu_targets[g], minibatches(g), noises[g]))
             after, m = member(g, mu_targets)(args)
             new[g] = jax.tree.map(lambda old, one, k=k: old.at[k].set(one), new[g], after)
             mu_targets[g] = new[g].actor_target
             metrics = metrics.at[:, i].set(jnp.stack(m))
     else:
-        for g, group in enumerate(spec.groups):
+        for g, group in enumerate(layout.groups):
             args = (state[g], mu_targets[g], minibatches(g), noises[g])
             next_action = None
             if rows.shape[0] == 1 and group.algorithm.critic == "central":
                 # One minibatch for all: its target actions are the same for every member, so compute them once.
                 _, own_target, batch, noise = jax.tree.map(lambda leaf: leaf[0], args)
                 batch = cut(g, batch) if one_by_one else batch
-                next_action = losses.target_actions(spec, group, hyper[g], mu_targets, own_target, batch, noise)
+                next_action = losses.target_actions(layout, group, hyper[g], mu_targets, own_target, batch, noise)
             new[g], m = _each_member(member(g, mu_targets, next_action), args, one_by_one, rows.shape[1])
             metrics = metrics.at[:, jnp.array(group.members)].set(jnp.stack(m))
     return tuple(new), UpdateMetrics(*metrics)
@@ -161,7 +162,7 @@ def _each_member(f: Callable, args: chex.ArrayTree, one_by_one: bool, batch: int
 
 
 def _update_agent(
-    spec: Spec,
+    layout: JointLayout,
     group: Group,
     hyper: HyperParams,
     move: bool,
@@ -177,7 +178,7 @@ def _update_agent(
     target actions, where they are known already."""
     algorithm = group.algorithm
     if next_action is None:
-        next_action = losses.target_actions(spec, group, hyper, mu_targets, own_target, batch, noise)
+        next_action = losses.target_actions(layout, group, hyper, mu_targets, own_target, batch, noise)
     y = losses.td_target(group, hyper, state.critic_target, batch, next_action)
 
     critic_gradient = jax.grad(lambda params: losses.critic_loss(group, params, batch, y), has_aux=True)

@@ -13,9 +13,9 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
 from matd3_jax.core import rollout
-from matd3_jax.core.agents import Spec
+from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
-from matd3_jax.core.rollout import Policy
+from matd3_jax.core.rollout import PolicyParams
 from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.envs.environment import Environment
 from matd3_jax.envs.wrappers.joint_team import JointTeam
@@ -35,7 +35,7 @@ class Side:
     team: str
     env: Environment
     """The environment without anybody's joining, or with this team joined into one agent."""
-    spec: Spec
+    layout: JointLayout
     """Of this team's agents alone, in the order of `env`."""
 
     @property
@@ -44,7 +44,7 @@ class Side:
         return _members(self.env, self.team)
 
     def act(
-        self, policy: Policy, state: Any, observation: tuple[chex.Array, ...], key: chex.PRNGKey | None
+        self, policy: PolicyParams, state: Any, observation: tuple[chex.Array, ...], key: chex.PRNGKey | None
     ) -> list[chex.Array]:
         """What the team's agents do in the environment without joining, one array [envs, ...] each.
 
@@ -54,11 +54,11 @@ class Side:
             key: of the noise; None: deterministic actions.
         """
         if not isinstance(self.env, JointTeam):
-            return list(rollout.decide(self.spec, policy, [observation[i] for i in self.members], key))
+            return list(rollout.decide(self.layout, policy, [observation[i] for i in self.members], key))
         (place,) = self.members
         seen = jax.vmap(self.env.join)(state, observation)[place]
         everybody: list = [None] * len(self.env.agents)
-        (everybody[place],) = rollout.decide(self.spec, policy, [seen], key)
+        (everybody[place],) = rollout.decide(self.layout, policy, [seen], key)
         parts = jax.vmap(self.env.split)(tuple(everybody))
         return [parts[i] for i in self.env.members]
 
@@ -67,7 +67,7 @@ class Team(NamedTuple):
     """A team of a run with the policies of all its seeds."""
 
     side: Side
-    policy: Policy
+    policy: PolicyParams
     """Leading axis [seeds]; actors and statistics of this team's agents only."""
 
 
@@ -78,13 +78,13 @@ def team_of(training: Training, env: Environment, state: TrainState, team: str) 
         env: the run's environment without joining.
         state: what was trained, leading axis [seeds].
     """
-    whole = training.spec
+    whole = training.layout
     who = _members(training.env, team)
     algorithm = whole.algorithms[who[0]]
     own = Side(
         team=team,
         env=JointTeam(env, (team,)) if algorithm.joint else env,
-        spec=Spec(
+        layout=JointLayout(
             agents=tuple(whole.agents[i] for i in who),
             teams=(team,) * len(who),
             observation_sizes=tuple(whole.observation_sizes[i] for i in who),
@@ -97,7 +97,7 @@ def team_of(training: Training, env: Environment, state: TrainState, team: str) 
     seeds = training.config.seeds
     policy = jax.tree.map(lambda leaf: np.asarray(leaf)[:seeds], training.trainer.policy(state, average=True))
     actors, hyper = [], []
-    for group in own.spec.groups:
+    for group in own.layout.groups:
         places = [whole.place(who[i]) for i in group.members]
         g, rows = places[0][0], [row for _, row in places]
         actors.append(jax.tree.map(lambda leaf, rows=rows: leaf[:, rows], policy.actors[g]))
@@ -106,7 +106,7 @@ def team_of(training: Training, env: Environment, state: TrainState, team: str) 
     if statistics is not None:
         parts = [[whole.observation_part(leaf, i) for i in who] for leaf in statistics]
         statistics = Statistics(*(np.concatenate(part, axis=-1) for part in parts))
-    return Team(own, Policy(tuple(actors), tuple(hyper), statistics))
+    return Team(own, PolicyParams(tuple(actors), tuple(hyper), statistics))
 
 
 def play(

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from matd3_jax.core import rollout
-from matd3_jax.core.agents import Spec
+from matd3_jax.core.agents import JointLayout
 from matd3_jax.training.loop import TrainState
 from matd3_jax.training.session import Training
 
@@ -89,7 +89,7 @@ def play(
     trainer = training.trainer
     # Through the host: the seeds may lie on different devices.
     policy = jax.device_get(jax.tree.map(lambda leaf: leaf[seed], trainer.policy(state, average=deterministic)))
-    env, spec = training.env, training.spec
+    env, layout = training.env, training.layout
 
     def run(policy, key):
         state_key, step_key = jax.random.split(key)
@@ -98,9 +98,9 @@ def play(
         def step(carry, key):
             state, observation = carry
             act_key, env_key = jax.random.split(key)
-            draws = None if deterministic else _noise(spec, act_key)
-            action = rollout.act(spec, policy, [o[None] for o in observation], draws)
-            actions = tuple(a[0] for a in rollout.env_actions(spec, action))
+            draws = None if deterministic else _noise(layout, act_key)
+            action = rollout.act(layout, policy, [o[None] for o in observation], draws)
+            actions = tuple(a[0] for a in rollout.env_actions(layout, action))
             after = env.step(jax.random.split(env_key, number + 1)[number], state, actions)
             kept = (keep(after.state), after.reward, after.terminated, after.truncated)
             return (after.state, after.observation), kept
@@ -116,18 +116,18 @@ def play(
     ended = np.flatnonzero(np.asarray(terminated | truncated))
     length = int(ended[0]) + 1 if len(ended) else steps
     so_far = np.cumsum(np.asarray(reward, np.float64)[:length], axis=0)
-    so_far = np.concatenate([np.zeros((1, spec.num_agents)), so_far])
+    so_far = np.concatenate([np.zeros((1, layout.num_agents)), so_far])
     return Episode(
         step=np.arange(length + 1),
         states=jax.tree.map(lambda leaf: leaf[: length + 1], states),
-        returns={team: so_far @ training.team_weights(team) for team in dict.fromkeys(spec.teams)},
+        returns={team: so_far @ training.team_weights(team) for team in dict.fromkeys(layout.teams)},
         terminated=bool(terminated[length - 1]),
         truncated=bool(truncated[length - 1]),
     )
 
 
-def _noise(spec: Spec, key: chex.PRNGKey) -> tuple[chex.Array, ...]:
+def _noise(layout: JointLayout, key: chex.PRNGKey) -> tuple[chex.Array, ...]:
     """Exploration noise [members, 1, action size] of every group."""
     return tuple(
-        group.policy.noise(jax.random.fold_in(key, g), (len(group.members), 1)) for g, group in enumerate(spec.groups)
+        group.policy.noise(jax.random.fold_in(key, g), (len(group.members), 1)) for g, group in enumerate(layout.groups)
     )

@@ -202,8 +202,8 @@ class Piece:
             learning_curves.learning_curve(run.curve, metrics, str(config.name))
             whole = summary.summary(metrics, {n: values[seeds] for n, values in row.items()}, **facts)
             if config.diagnostics.q_bias:
-                whole["overestimation"] = overestimation.summary(metrics, self.training.spec.agents)
-                q_bias.draw(run.q_bias, metrics, self.training.spec.by_team(), str(config.name))
+                whole["overestimation"] = overestimation.summary(metrics, self.training.layout.agents)
+                q_bias.draw(run.q_bias, metrics, self.training.layout.by_team(), str(config.name))
             run.write_summary(whole)
 
     def _announce(self) -> None:

@@ -118,7 +118,7 @@ def restore(path: Path, trainer: Trainer, share: Share | None = None) -> TrainSt
         filled = trainer.filled_rows(int(small.collects))
         local = []
         for device, seeds in trainer.device_seeds():
-            shape = (len(seeds), trainer.schedule.replay_capacity, trainer.spec.row_size)
+            shape = (len(seeds), trainer.schedule.replay_capacity, trainer.layout.row_size)
             rows = jax.device_put(jnp.zeros(shape, jnp.float32, device=device), device)
             for place, seed in enumerate(seeds):
                 one = np.asarray(checkpointer.restore(path / "replay" / str(share.first + seed))["rows"])
@@ -126,7 +126,7 @@ def restore(path: Path, trainer: Trainer, share: Share | None = None) -> TrainSt
                     raise UserError(f"{path}: a replay of shape {one.shape} does not fit these settings")
                 rows = _put_rows(rows, jax.device_put(one[None], device), place)
             local.append(rows)
-    shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.spec.row_size)
+    shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.layout.row_size)
     rows = jax.make_array_from_single_device_arrays(shape, trainer.shardings.replay, local)
     return small._replace(replay=rows)
 

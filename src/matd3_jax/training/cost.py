@@ -13,7 +13,7 @@ from jax.sharding import NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from matd3_jax.core import update
-from matd3_jax.core.agents import Group, Spec
+from matd3_jax.core.agents import Group, JointLayout
 from matd3_jax.envs.environment import Environment
 from matd3_jax.training.schedule import Schedule
 from matd3_jax.training.session import Training
@@ -29,30 +29,30 @@ compiling MJX."""
 # ---- counted ---------------------------------------------------------------------------------------------------------
 
 
-def acting_flops(spec: Spec) -> float:
+def acting_flops(layout: JointLayout) -> float:
     """Floating point operations of the policies' matrix products in one env step of one seed."""
-    return 2.0 * sum(len(group.members) * _forward(_actor(group)) for group in spec.groups)
+    return 2.0 * sum(len(group.members) * _forward(_actor(group)) for group in layout.groups)
 
 
-def update_flops(spec: Spec, schedule: Schedule) -> float:
+def update_flops(layout: JointLayout, schedule: Schedule) -> float:
     """Floating point operations of the matrix products in one update of one seed, all agents, actors counted as often
     as they move."""
-    return 2.0 * schedule.batch_size * sum(len(g.members) * _member(spec, schedule, g) for g in spec.groups)
+    return 2.0 * schedule.batch_size * sum(len(g.members) * _member(layout, schedule, g) for g in layout.groups)
 
 
-def step_flops(spec: Spec, schedule: Schedule) -> float:
+def step_flops(layout: JointLayout, schedule: Schedule) -> float:
     """Floating point operations of the matrix products in one env step of one seed once it learns."""
     updates = schedule.updates_per_collect / schedule.collect_steps
-    return acting_flops(spec) + updates * update_flops(spec, schedule)
+    return acting_flops(layout) + updates * update_flops(layout, schedule)
 
 
-def _member(spec: Spec, schedule: Schedule, group: Group) -> float:
+def _member(layout: JointLayout, schedule: Schedule, group: Group) -> float:
     """Multiplications of one agent's update, for each transition: see `core.losses`."""
     algorithm, size = group.algorithm, group.action_space.size
-    actor, critic = _actor(group), (update.critic_input_size(spec, group), *group.algorithm.hidden, 1)
+    actor, critic = _actor(group), (update.critic_input_size(layout, group), *group.algorithm.hidden, 1)
     target_actions = _forward(actor)
     if algorithm.critic == "central":
-        target_actions = sum(len(other.members) * _forward(_actor(other)) for other in spec.groups)
+        target_actions = sum(len(other.members) * _forward(_actor(other)) for other in layout.groups)
         if schedule.shared_minibatch and not schedule.sequential:
             target_actions /= len(group.members)
     # The targets' values, the critics' own, their gradients.
@@ -167,13 +167,13 @@ def _repeated(program: Callable[[int], Any], wanted: float) -> tuple[int, float]
 
 def expectation(training: Training, done: int = 0) -> str:
     """How long the run is going to take after env step `done`, and how that is known, in a line."""
-    trainer, spec = training.trainer, training.spec
+    trainer, layout = training.trainer, training.layout
     schedule = trainer.schedule
     if training.processes.size > 1 or not trainer.on_cpu:
         where = "several processes" if training.processes.size > 1 else "an accelerator"
         return f"expected: not estimated for {where}; the first interval shows the rate and the time left"
-    group = max(spec.groups, key=lambda g: len(g.members) * _member(spec, schedule, g))
-    critic = (update.critic_input_size(spec, group), *group.algorithm.hidden, 1)
+    group = max(layout.groups, key=lambda g: len(g.members) * _member(layout, schedule, g))
+    critic = (update.critic_input_size(layout, group), *group.algorithm.hidden, 1)
     layer = max(pairwise(critic), key=lambda sizes: sizes[0] * sizes[1])
     # Larger products are done at the same rate, and take longer to measure.
     shape = (min(size, 1024) for size in (schedule.batch_size // trainer.devices_per_seed, *layer))
@@ -187,7 +187,7 @@ def expectation(training: Training, done: int = 0) -> str:
         evaluations += 1  # of the untrained policies
     evaluated = evaluations * training.config.eval_episodes * training.env.episode_length
     updates = learning * schedule.updates_per_collect / schedule.collect_steps
-    flops = (steps + evaluated) * acting_flops(spec) + updates * update_flops(spec, schedule)
+    flops = (steps + evaluated) * acting_flops(layout) + updates * update_flops(layout, schedule)
     seconds = trainer.rows * flops / (REACHED * products)
     how = f"products at {products / 1e9:.3g} GFLOP/s measured on these devices"
     if physics is None:

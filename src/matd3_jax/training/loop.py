@@ -13,10 +13,10 @@ from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from matd3_jax.core import minibatch, n_step, q_bias, replay, rollout, running_statistics, update
-from matd3_jax.core.agents import Spec
+from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.q_bias import Pairs, Reservoir, Values
-from matd3_jax.core.rollout import EnvState, Episodes, Evaluation, Policy
+from matd3_jax.core.rollout import EnvState, Episodes, Evaluation, PolicyParams
 from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.core.update import GroupState, UpdateMetrics
 from matd3_jax.envs.environment import Environment
@@ -58,7 +58,7 @@ class Trainer:
     """Programs that start and advance the training of `num_seeds` seeds.
 
     Args:
-        spec: agents and algorithms of `env`.
+        layout: agents and algorithms of `env`.
         hyper: for each team its `HyperParams`, every leaf a number or an array [seeds].
         devices: where the seeds are spread out; default all devices.
         devices_per_seed: how many of the devices share the work of one seed, each with an equal part of every
@@ -79,7 +79,7 @@ class Trainer:
     def __init__(
         self,
         env: Environment,
-        spec: Spec,
+        layout: JointLayout,
         schedule: Schedule,
         hyper: dict[str, HyperParams],
         num_seeds: int,
@@ -92,12 +92,12 @@ class Trainer:
         unroll_steps: int = 1,
         devices_per_seed: int | None = None,
     ):
-        self.env, self.spec, self.schedule, self.num_seeds = env, spec, schedule, num_seeds
+        self.env, self.layout, self.schedule, self.num_seeds = env, layout, schedule, num_seeds
         self.unroll, self.unroll_steps = unroll, unroll_steps
         self.normalise_observations, self.q_bias_pairs = normalise_observations, q_bias_pairs
         self.least_deviation = least_deviation
         updates = schedule.updates_per_collect
-        for group in spec.groups:
+        for group in layout.groups:
             delay = group.algorithm.policy_delay
             if updates % delay and delay % updates:
                 raise ValueError(f"updates_per_collect={updates} and policy_delay={delay}: one must divide the other")
@@ -116,7 +116,7 @@ class Trainer:
         self.rows = self.local_seeds * places
         """Seeds actually run: `num_seeds` filled up to a multiple of the mesh with copies of the last one."""
         self.piece = piece or (1 if self.on_cpu else self.local_seeds)
-        per_group = [hyper[spec.teams[group.members[0]]] for group in spec.groups]
+        per_group = [hyper[layout.teams[group.members[0]]] for group in layout.groups]
         spread = [
             jax.tree.map(lambda h: jnp.broadcast_to(jnp.asarray(h, jnp.float32), num_seeds), h) for h in per_group
         ]
@@ -127,7 +127,7 @@ class Trainer:
     @cached_property
     def period(self) -> int:
         """Updates after which every group's policy delay has come round."""
-        return math.lcm(*(group.algorithm.policy_delay for group in self.spec.groups))
+        return math.lcm(*(group.algorithm.policy_delay for group in self.layout.groups))
 
     @cached_property
     def cycle_collects(self) -> int:
@@ -153,7 +153,7 @@ class Trainer:
     @property
     def replay_bytes(self) -> int:
         """Memory of the replay of all seeds, on all devices that have it."""
-        return 4 * self.devices_per_seed * self.rows * self.schedule.replay_capacity * self.spec.row_size
+        return 4 * self.devices_per_seed * self.rows * self.schedule.replay_capacity * self.layout.row_size
 
     def filled_rows(self, collects: int) -> int:
         """Transitions in each seed's replay after `collects` collects."""
@@ -189,7 +189,7 @@ class Trainer:
         init = self._init if isinstance(keys, jax.core.Tracer) else self._compiled_init
         state = init(self.fill(keys))
         capacity = self.schedule.replay_capacity
-        allocate = partial(replay.allocate, self.rows, capacity, self.spec.row_size)
+        allocate = partial(replay.allocate, self.rows, capacity, self.layout.row_size)
         return state._replace(replay=jax.jit(allocate, out_shardings=self.shardings.replay)())
 
     def abstract_state(self) -> TrainState:
@@ -201,18 +201,18 @@ class Trainer:
     def _init(self) -> Callable:
         def one(key):
             network_key, env_key, key = jax.random.split(key, 3)
-            env = rollout.start(self.env, env_key, self.schedule.num_envs, rollout.ranged(self.spec))
-            return update.init(self.spec, network_key), env, key
+            env = rollout.start(self.env, env_key, self.schedule.num_envs, rollout.ranged(self.layout))
+            return update.init(self.layout, network_key), env, key
 
         def init(keys):
             groups, env, keys = jax.vmap(one)(keys)
             state = TrainState(groups, env, jnp.zeros((keys.shape[0], 0, 0)), keys, jnp.int32(0))
             if self.q_bias_pairs:
-                pairs = jax.vmap(lambda s: q_bias.allocate(s, self.q_bias_pairs, self.spec))(env.state)
+                pairs = jax.vmap(lambda s: q_bias.allocate(s, self.q_bias_pairs, self.layout))(env.state)
                 state = state._replace(reservoir=Reservoir(pairs, jnp.int32(0)))
             if not self.normalise_observations:
                 return state
-            fresh = running_statistics.initial(self.spec.observation_size)
+            fresh = running_statistics.initial(self.layout.observation_size)
             spread = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (keys.shape[0], *leaf.shape)), fresh)
             return state._replace(statistics=spread)
 
@@ -234,7 +234,9 @@ class Trainer:
         reservoir = Reservoir(seeds, everywhere) if self.q_bias_pairs else None
         return TrainState(seeds, seeds, seeds, seeds, everywhere, statistics, reservoir)
 
-    def policy(self, state: TrainState, hyper: tuple[HyperParams, ...] | None = None, average: bool = False) -> Policy:
+    def policy(
+        self, state: TrainState, hyper: tuple[HyperParams, ...] | None = None, average: bool = False
+    ) -> PolicyParams:
         """How each seed acts, leading axis [seeds].
 
         Args:
@@ -245,7 +247,7 @@ class Trainer:
         actors = tuple(
             group.actor if mean is None else mean for group, mean in zip(state.groups, averages, strict=True)
         )
-        return Policy(actors, self.hyper if hyper is None else hyper, self.scale(state))
+        return PolicyParams(actors, self.hyper if hyper is None else hyper, self.scale(state))
 
     def scale(self, state: TrainState) -> Statistics | None:
         """What observations are normalized by: running statistics, with the least deviation that is set."""
@@ -259,7 +261,15 @@ class Trainer:
         def one(policy, env, key):
             length, kept = self.schedule.rollout_length, self.q_bias_pairs > 0
             return rollout.collect(
-                self.env, self.spec, policy, env, key, length, random=random, keep_states=kept, unroll=self.unroll_steps
+                self.env,
+                self.layout,
+                policy,
+                env,
+                key,
+                length,
+                random=random,
+                keep_states=kept,
+                unroll=self.unroll_steps,
             )
 
         keys = jax.vmap(partial(jax.random.split, num=2))(state.key)
@@ -268,11 +278,11 @@ class Trainer:
             # A key apart from those that `rollout.collect` splits off the same one: training stays as it is without.
             apart = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys[:, 0], rollout.APART)
             share = 1 / (state.collects + 1.0 - state.reservoir.since)
-            new = Pairs(states, self.spec.row_parts(rows).inputs)
+            new = Pairs(states, self.layout.row_parts(rows).inputs)
             pairs = jax.vmap(q_bias.keep, in_axes=(0, 0, None, 0))(state.reservoir.pairs, new, share, apart)
             state = state._replace(reservoir=state.reservoir._replace(pairs=pairs))
         if state.statistics is not None:
-            x = self.spec.row_parts(rows).x
+            x = self.layout.row_parts(rows).x
             merge = jax.vmap(running_statistics.merge, in_axes=(0, 0, None))
             state = state._replace(statistics=merge(state.statistics, x, state.collects))
         rows = replay.write(state.replay, rows, state.collects)
@@ -287,9 +297,9 @@ class Trainer:
 
     def learn(self, state: TrainState, hyper, first: int) -> tuple[TrainState, UpdateMetrics]:
         """The updates after one collect, piece after piece of the local seeds; `first`: number of the first of them."""
-        schedule, groups = self.schedule, self.spec.groups
+        schedule, groups = self.schedule, self.layout.groups
         size = replay.filled(schedule.replay_capacity, schedule.collect_steps, state.collects)
-        batches = 1 if schedule.shared_minibatch else self.spec.num_agents
+        batches = 1 if schedule.shared_minibatch else self.layout.num_agents
         unrolled = math.gcd(self.period, schedule.updates_per_collect)
         axis = "minibatch" if self.devices_per_seed > 1 else None
 
@@ -301,7 +311,7 @@ class Trainer:
                 rows = self.minibatches(state, hyper, seed, minibatch.own_part(indices, axis, dimension=-1))
                 move = [(first + u + 1) % group.algorithm.policy_delay == 0 for group in groups]
                 states, m = update.update(
-                    self.spec, states, hyper, rows, update_key, move, schedule.sequential, self.on_cpu, axis
+                    self.layout, states, hyper, rows, update_key, move, schedule.sequential, self.on_cpu, axis
                 )
                 metrics.append(m)
             return states, jax.tree.map(lambda *m: jnp.stack(m), *metrics)
@@ -329,17 +339,17 @@ class Trainer:
     ) -> chex.Array:
         """What updates take: the rows [*indices.shape, row_size] of a local seed and its `hyper`, rewards of n_step
         steps in them, observations normalised."""
-        schedule, spec = self.schedule, self.spec
-        if spec.n_step == 1:
+        schedule, layout = self.schedule, self.layout
+        if layout.n_step == 1:
             rows = replay.gather(state.replay, seed, indices)
         else:
             written = replay.Written(schedule.replay_capacity, schedule.collect_steps, state.collects)
-            gamma = jnp.stack([jnp.asarray(hyper[spec.place(i)[0]].gamma) for i in range(spec.num_agents)])
-            rows = n_step.draw(spec, state.replay, seed, indices, written, schedule.num_envs, gamma)
+            gamma = jnp.stack([jnp.asarray(hyper[layout.place(i)[0]].gamma) for i in range(layout.num_agents)])
+            rows = n_step.draw(layout, state.replay, seed, indices, written, schedule.num_envs, gamma)
         scale = self.scale(state)
         if scale is None:
             return rows
-        return running_statistics.normalise_rows(self.spec, jax.tree.map(lambda s: s[seed], scale), rows)
+        return running_statistics.normalise_rows(self.layout, jax.tree.map(lambda s: s[seed], scale), rows)
 
     def cycle(self, state: TrainState, hyper) -> tuple[TrainState, Metrics]:
         episodes, metrics = [], []
@@ -380,7 +390,7 @@ class Trainer:
     def _evaluate(self) -> Callable:
         def evaluate(policy, keys, episodes, deterministic):
             def one(policy, key):
-                return rollout.evaluate(self.env, self.spec, policy, key, episodes, deterministic)
+                return rollout.evaluate(self.env, self.layout, policy, key, episodes, deterministic)
 
             return self._sharded(jax.vmap(one), P("seeds"), P("seeds"))(policy, keys)
 
@@ -398,7 +408,7 @@ class Trainer:
         def measure(policy, critics, pairs, keys, steps):
             def one(policy, critics, pairs, key):
                 apart = jax.random.fold_in(key, rollout.APART)
-                return q_bias.measure(self.env, self.spec, policy, critics, pairs, apart, steps)
+                return q_bias.measure(self.env, self.layout, policy, critics, pairs, apart, steps)
 
             return self._sharded(jax.vmap(one), P("seeds"), P("seeds"))(policy, critics, pairs, keys)
 

@@ -33,24 +33,24 @@ def needed(trainer: Trainer, seeds: int) -> int:
 
 def seed_bytes(trainer: Trainer) -> int:
     """Bytes of one seed beside its replay: its state, twice while it changes, and a collect with its fresh starts."""
-    schedule, spec = trainer.schedule, trainer.spec
+    schedule, layout = trainer.schedule, trainer.layout
     state = trainer.abstract_state()
     whole = size(state._replace(replay=None, collects=None)) // trainer.rows  # type: ignore[arg-type]
     one_env = size(state.env) // (trainer.rows * schedule.num_envs)
     # Each transition of a collect: its row, what it is packed from, and a fresh start.
-    return 2 * whole + schedule.collect_steps * (2 * 4 * spec.row_size + 2 * one_env)
+    return 2 * whole + schedule.collect_steps * (2 * 4 * layout.row_size + 2 * one_env)
 
 
 def update_bytes(trainer: Trainer) -> int:
     """Bytes that one seed's update takes beside its state: minibatches, noise, activations and their gradients."""
-    spec, schedule = trainer.spec, trainer.schedule
-    agents = 1 if trainer.on_cpu else spec.num_agents  # agents updated at the same time
+    layout, schedule = trainer.layout, trainer.schedule
+    agents = 1 if trainer.on_cpu else layout.num_agents  # agents updated at the same time
     widest = max(
-        group.algorithm.num_critics * sum(group.algorithm.hidden) + spec.observation_size + spec.action_size
-        for group in spec.groups
+        group.algorithm.num_critics * sum(group.algorithm.hidden) + layout.observation_size + layout.action_size
+        for group in layout.groups
     )
-    rows = spec.num_agents * spec.row_size  # gathered for all agents at once
-    noise = spec.num_agents * 3 * spec.action_size
+    rows = layout.num_agents * layout.row_size  # gathered for all agents at once
+    noise = layout.num_agents * 3 * layout.action_size
     return 4 * schedule.batch_size * (2 * rows + noise + agents * 4 * widest)
 
 

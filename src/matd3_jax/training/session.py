@@ -13,7 +13,7 @@ import numpy as np
 from matd3_jax import config as configuration
 from matd3_jax import envs
 from matd3_jax.config import Config
-from matd3_jax.core.agents import Spec
+from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.rollout import Episodes, Evaluation
 from matd3_jax.envs.environment import Environment
@@ -88,7 +88,7 @@ class Training:
         for team in joint:
             base = JointTeam(base, (team,))
         self.env = base
-        self.spec = Spec.of(self.env, {team: algo.algorithm() for team, algo in teams.items()}, config.n_step)
+        self.layout = JointLayout.of(self.env, {team: algo.algorithm() for team, algo in teams.items()}, config.n_step)
         schedule = Schedule(
             num_envs=config.num_envs,
             rollout_length=config.rollout_length,
@@ -105,7 +105,7 @@ class Training:
         local = jax.local_devices()
         least = config.normalise_least_deviation
         options: dict[str, Any] = {"normalise_observations": normalise, "least_deviation": least}
-        trainer = Trainer(self.env, self.spec, schedule, hyper, seeds, local, **options)
+        trainer = Trainer(self.env, self.layout, schedule, hyper, seeds, local, **options)
         # Whole chunks of equal length, so that one compiled program does for all; as many as come closest to log_every.
         cycles = max(1, math.ceil((config.total_steps - trainer.prefill_steps) / trainer.cycle_steps))
         wanted = max(1, round((config.log_every or config.total_steps / 100) / trainer.cycle_steps))
@@ -117,7 +117,7 @@ class Training:
         capacity = min(config.replay_capacity, self.total_steps)
         schedule = dataclasses.replace(schedule, replay_capacity=capacity)
         kept = config.diagnostics.q_bias_rollouts if config.diagnostics.q_bias else 0
-        self.trainer = Trainer(self.env, self.spec, schedule, hyper, seeds, local, q_bias_pairs=kept, **options)
+        self.trainer = Trainer(self.env, self.layout, schedule, hyper, seeds, local, q_bias_pairs=kept, **options)
 
     def _hyper(self, team: str) -> HyperParams:
         """The team's hyper-parameters, leaves [seeds]."""
@@ -129,7 +129,7 @@ class Training:
     @property
     def memory(self) -> str:
         """The arithmetic of the replay's memory."""
-        t, s = self.trainer, self.spec
+        t, s = self.trainer, self.layout
         copies = f"{t.devices_per_seed} copies x " if t.devices_per_seed > 1 else ""
         whose = f" of process {self.processes.index}" if self.processes.size > 1 else ""
         return (
@@ -195,20 +195,20 @@ class Training:
             length = episodes.length / episodes.count
         row["episodes"] = episodes.count.astype(int)
         row["episode_length"] = length
-        for team in dict.fromkeys(self.spec.teams):
+        for team in dict.fromkeys(self.layout.teams):
             row[f"return_{team}"] = returns @ self.team_weights(team)
-        for i, agent in enumerate(self.spec.agents):
+        for i, agent in enumerate(self.layout.agents):
             row[f"{agent}_return"] = returns[:, i]
         losses = metrics.update._asdict() if metrics.update is not None else {}
         for name in ("critic_loss", "q_value", "actor_loss"):
             values = np.asarray(losses[name], np.float64)[:seeds].mean(axis=1) if losses else None
-            for i, agent in enumerate(self.spec.agents):
+            for i, agent in enumerate(self.layout.agents):
                 row[f"{agent}_{name}"] = np.full(seeds, np.nan) if values is None else values[:, i]
         return row
 
     def team_weights(self, team: str) -> np.ndarray:
         """Weights [agents] of the agents' returns in the number reported for a team (`Environment.return_weights`)."""
-        member = np.array([t == team for t in self.spec.teams])
+        member = np.array([t == team for t in self.layout.teams])
         return np.where(member, self.env.return_weights, 0.0)
 
     # ---- evaluation --------------------------------------------------------------------------------------------------
@@ -256,15 +256,17 @@ class Training:
         if not self.eval_every:
             return {}
         if state is None:
-            sizes = (self.spec.num_agents, 1, len(self.env.measures))
+            sizes = (self.layout.num_agents, 1, len(self.env.measures))
             returns, length, measures = (np.full((len(self.seeds), size), np.nan) for size in sizes)
         else:
             found = self.evaluate(state, self.config.eval_episodes, deterministic=True)
             returns, length, measures = (leaf.mean(axis=1).reshape(len(self.seeds), -1) for leaf in found)
-        columns = {f"eval_return_{team}": returns @ self.team_weights(team) for team in dict.fromkeys(self.spec.teams)}
+        columns = {
+            f"eval_return_{team}": returns @ self.team_weights(team) for team in dict.fromkeys(self.layout.teams)
+        }
         columns["eval_episode_length"] = length[:, 0]
         columns |= {f"eval_{name}": measures[:, k] for k, name in enumerate(self.env.measures)}
-        columns |= {f"{agent}_eval_return": returns[:, i] for i, agent in enumerate(self.spec.agents)}
+        columns |= {f"{agent}_eval_return": returns[:, i] for i, agent in enumerate(self.layout.agents)}
         return columns
 
     def q_bias(self, state: TrainState, due: bool) -> tuple[TrainState, Row]:
@@ -277,7 +279,7 @@ class Training:
         if due and int(state.collects) > int(state.reservoir.since):
             found = self.trainer.measure_q_bias(state, self.config.diagnostics.q_bias_steps)
             state = self.trainer.restart_reservoir(state)
-        return state, overestimation.columns(self.spec.agents, found, len(self.seeds))
+        return state, overestimation.columns(self.layout.agents, found, len(self.seeds))
 
 
 def train(
