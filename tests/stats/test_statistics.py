@@ -26,7 +26,7 @@ from matd3_jax.stats import bootstrap
 from matd3_jax.stats.bootstrap import aggregate, average, performance_profile, probability_of_improvement
 from matd3_jax.stats.intervals import compare, mean_interval, t_interval, welch_interval
 
-RLIABLE = json.loads((Path(__file__).parent / "data" / "rliable.json").read_text())
+RLIABLE = json.loads((Path(__file__).parents[1] / "data" / "rliable.json").read_text())
 X, Y = np.array(RLIABLE["x"]), np.array(RLIABLE["y"])
 SCORES = {"x": X, "y": Y, "x_first_task": X[:, :1]}
 
