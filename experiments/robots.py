@@ -14,7 +14,7 @@ from experiments import evaluations, figures, study, verdict
 from experiments.study import Study
 from experiments.tidy import Table
 from experiments.verdict import Claim
-from matd3_jax import command
+from matd3_jax.cli import command
 
 ROBOTS = {
     ("ant", "2x4"): None,

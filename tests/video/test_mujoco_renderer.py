@@ -137,10 +137,11 @@ def test_drawing_works_whoever_imported_mujoco_first(gl):
 
 WITHOUT = """
 import sys, types
-from matd3_jax import command, rendering
+from matd3_jax.cli import command
+from matd3_jax.video import frames
 env = types.SimpleNamespace(mj_model=None, agent_bodies=(), agents=(), qpos=None)
 sys.argv = ["render"]
-command.run(lambda argv: rendering.drawing_of(env))
+command.run(lambda argv: frames.drawing_of(env))
 """
 
 
