@@ -192,10 +192,10 @@ def _options(argv: Sequence[str]) -> dict[str, Any]:
     for key, allowed in (("x", curves.AXES), ("average", bootstrap.AVERAGES)):
         if options[key] not in allowed:
             raise UserError(f"{key}={options[key]!r}: must be one of {', '.join(allowed)}")
-    allowed = INTERVALS[options["average"]]
-    options["interval"] = allowed[0] if options["interval"] is None else options["interval"]
-    if options["interval"] not in allowed:
-        raise UserError(f"interval={options['interval']!r}: must be one of {', '.join(allowed)} "
+    offered = INTERVALS[options["average"]]
+    options["interval"] = offered[0] if options["interval"] is None else options["interval"]
+    if options["interval"] not in offered:
+        raise UserError(f"interval={options['interval']!r}: must be one of {', '.join(offered)} "
                         f"with average={options['average']}")  # fmt: skip
     window = options["window"]
     if window is not None and (type(window) is not int or window < 1):
