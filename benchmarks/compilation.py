@@ -1,7 +1,7 @@
 """`python -m benchmarks.compilation env=NAME [key=value ...]`: how long train's programs take to compile, as JSON.
 
 The programs of `python -m matd3_jax.train` with these settings, in the order in which it needs them: start (networks,
-environments and an empty replay, run once), prefill, evaluation, chunk. Of each: seconds to trace it, to lower it to
+environments and an empty replay, run once), warm-up, evaluation, interval. Of each: seconds to trace it, to lower it to
 XLA's input, and to compile it or to read it from the compilation cache; "cpu" is the processor time of all three. The
 replay has `learning_starts` rows, their number does not change the work; nothing is trained.
 `benchmarks.compile_times` calls this once for each environment and state of the cache.
@@ -21,7 +21,7 @@ import jax  # noqa: E402
 from matd3_jax import config  # noqa: E402
 from matd3_jax.cli import command  # noqa: E402
 from matd3_jax.runtime import devices  # noqa: E402
-from matd3_jax.training.session import Training  # noqa: E402
+from matd3_jax.training.session import TrainingSession  # noqa: E402
 
 EVENTS = {
     "/jax/core/compile/jaxpr_trace_duration": "trace",
@@ -37,7 +37,7 @@ def main(argv: Sequence[str]) -> int:
     imported = time.perf_counter() - BEGUN
     programs = {}
     begun = time.perf_counter(), time.process_time()
-    training = Training(settings)
+    training = TrainingSession(settings)
     trainer = training.trainer
     found = dict.fromkeys(EVENTS.values(), 0.0)
 
@@ -53,9 +53,9 @@ def main(argv: Sequence[str]) -> int:
         return trainer.evaluate(state, keys, settings.eval_episodes, True)
 
     for name, jitted, arguments in (
-        ("prefill", trainer.prefill.jitted, (state, trainer.hyper)),
+        ("warm-up", trainer.warm_up.jitted, (state, trainer.hyper)),
         ("evaluation", jax.jit(evaluate), (state, training.keys())),
-        ("chunk", training.chunk.jitted, (state, trainer.hyper)),
+        ("interval", training.interval.jitted, (state, trainer.hyper)),
     ):
         begun = time.perf_counter(), time.process_time()
         traced = jitted.trace(*arguments)

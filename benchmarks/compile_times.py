@@ -30,7 +30,7 @@ from matd3_jax.errors import UserError, nearest
 from matd3_jax.runtime import devices
 
 DEFAULTS: dict[str, Any] = {"envs": None, "repeats": 1, "at_once": 1, "out": None}
-PROGRAMS = ("start", "prefill", "evaluation", "chunk")
+PROGRAMS = ("start", "warm-up", "evaluation", "interval")
 LIMIT = 30.0
 """Seconds of a core for one program, cold: more is a defect to look into."""
 

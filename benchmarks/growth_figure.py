@@ -16,12 +16,12 @@ from matd3_jax.figures.learning_curves import COLOURS, PAPER
 LABELS = {"seeds": "seeds", "agents": "agents", "replay": "transitions in each replay", "batch": "minibatch"}
 ORDERS = {"agents": (2, 3)}
 """Powers drawn for the eye; elsewhere the first."""
-MEMORY = {"process": (1, "process at most"), "xla": (0, "the chunk's, by XLA"), "replay": (4, "of it the replay")}
+MEMORY = {"process": (1, "process at most"), "xla": (0, "the interval's, by XLA"), "replay": (4, "of it the replay")}
 NAMES = {1: "linear", 2: "quadratic", 3: "cubic"}
 
 
 def draw(path: Path, axes: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
-    """One column an axis: above, the time of a cycle, below, memory; both scales logarithmic.
+    """One column an axis: above, the time of an iteration, below, memory; both scales logarithmic.
 
     Args:
         axes: {axis: points} as `benchmarks.growth` reports them; points with an "error" are left out.
@@ -47,7 +47,7 @@ def draw(path: Path, axes: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
             _guides(top, x, times[0, 0], ORDERS.get(name, (1,)))
             _guides(bottom, x, memory[0], ORDERS.get(name, (1,)))
             bottom.set_xlabel(LABELS[name])
-        grid[0, 0].set_ylabel("ms a cycle, all seeds")
+        grid[0, 0].set_ylabel("ms an iteration, all seeds")
         grid[1, 0].set_ylabel("MB")
         _limits(grid[0], [[p["cycle_seconds"] * 1000] for points in columns.values() for p in points])
         _limits(grid[1], [[p["memory"][key] / 1e6 for key in MEMORY] for points in columns.values() for p in points])

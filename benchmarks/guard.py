@@ -50,9 +50,9 @@ BOUNDS = {
     # loop, hence the slack.
     "rollout_share": Bound("time of the rollouts over that of the whole loop", 2.0, 0.05),
     # Counted by the compiler, so always the same; one device or two differ by 0.05. A copy of the replay adds 1.
-    "memory_over_replay": Bound("memory of the compiled chunk over that of the replay", 1.0, 0.5),
+    "memory_over_replay": Bound("memory of the compiled interval over that of the replay", 1.0, 0.5),
     # None is the only number that will do.
-    "replay_copies": Bound("copies of the whole replay in the compiled chunk", 1.0),
+    "replay_copies": Bound("copies of the whole replay in the compiled interval", 1.0),
 }
 
 
@@ -103,9 +103,9 @@ def measure() -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
     for _ in range(ROUNDS):
         loops.append(loop.cycle_seconds(calls))
         begun = time.perf_counter()
-        loop.state, _ = jax.block_until_ready(trainer.prefill(loop.state))
-        collects = (time.perf_counter() - begun) / trainer.schedule.prefill_collects
-        rollouts.append(trainer.cycle_collects * collects)
+        loop.state, _ = jax.block_until_ready(trainer.warm_up(loop.state))
+        rollouts = (time.perf_counter() - begun) / trainer.schedule.warmup_rollouts
+        rollouts.append(trainer.rollouts_per_iteration * rollouts)
         rates.append(throughput.matmul_gflops(2))
     around = (np.array(rates[1:]) + np.array(rates[:-1])) / 2
     in_turns = {
@@ -121,7 +121,8 @@ def measure() -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
 
 
 def floor_seconds(loop: Loop, gflops: Any) -> Any:
-    """The least time that a cycle's matrix products take where all devices together do `gflops` (an array, too)."""
+    """The least time that an iteration's matrix products take where all devices together do `gflops` (an array,
+    too)."""
     return loop.cycle_flops / 1e9 / gflops
 
 

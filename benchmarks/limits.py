@@ -1,11 +1,11 @@
-"""`python -m benchmarks.limits`: what this machine could do at most: the least time of one cycle of training.
+"""`python -m benchmarks.limits`: what this machine could do at most: the least time of one iteration of training.
 
     python -m benchmarks.limits [seeds=20] [repeats=5] [out=FILE.json] [key=value ...]
 
 Other keys are settings of the run, as `python -m matd3_jax.train` takes them. Measured in the same run, on the same
 devices: the rate of every matrix product of the loop, by itself and at its own shape (batched over seeds, agents and
 twins as the loop has them; on one device alone, and on all at once), and the memory's bandwidth. From these and the
-products of one cycle, counted by hand and again in the compiled program, follows the floor: the time that the
+products of one iteration, counted by hand and again in the compiled program, follows the floor: the time that the
 products alone take, or the bytes that must be moved at least, whichever is more. Nothing else is in it: no bias, no
 ReLU, no random numbers, no sampling, no optimiser, no environment.
 """
@@ -33,8 +33,8 @@ from matd3_jax.core import update
 from matd3_jax.core.agents import Group
 from matd3_jax.runtime import devices
 from matd3_jax.training import memory
-from matd3_jax.training.loop import Trainer
-from matd3_jax.training.session import Training
+from matd3_jax.training.loop import TrainLoop
+from matd3_jax.training.session import TrainingSession
 
 DEFAULTS: dict[str, Any] = {"seeds": 20, "repeats": 5, "out": None}
 
@@ -56,7 +56,7 @@ class Product:
 
 @dataclasses.dataclass(frozen=True)
 class Floor:
-    """The least time of one cycle of all seeds together, seconds."""
+    """The least time of one iteration of all seeds together, seconds."""
 
     alone: float
     """Products, every device as fast as it is when the others rest."""
@@ -65,7 +65,7 @@ class Floor:
     moved: float
     """Bytes that must be read or written, all devices at once."""
     flops: float
-    """Of the products of one cycle, all seeds."""
+    """Of the products of one iteration, all seeds."""
 
     @property
     def seconds(self) -> float:
@@ -80,12 +80,13 @@ class Floor:
 # ---- counted by hand -------------------------------------------------------------------------------------------------
 
 
-def products(trainer: Trainer, part: str = "loop") -> dict[Product, float]:
-    """How many of each product one device does in one cycle: of the "rollout", the "update", or the whole "loop"."""
+def products(trainer: TrainLoop, part: str = "loop") -> dict[Product, float]:
+    """How many of each product one device does in one iteration: of the "rollout", the "update", or the whole
+    "loop"."""
     schedule, layout = trainer.schedule, trainer.layout
     found: dict[Product, float] = {}
     local = trainer.local_seeds
-    updates = trainer.cycle_collects * schedule.updates_per_collect
+    updates = trainer.rollouts_per_iteration * schedule.updates_per_collect
     for group in layout.groups:
         together = trainer.piece * (1 if trainer.on_cpu else len(group.members))
         times = local * len(group.members) / together * updates
@@ -95,11 +96,11 @@ def products(trainer: Trainer, part: str = "loop") -> dict[Product, float]:
         sizes = (group.observation_size, *group.algorithm.hidden, group.action_space.size)
         acting = _forward((local, len(group.members)), schedule.num_envs, sizes) if part != "update" else []
         for product in acting:
-            found[product] = found.get(product, 0) + trainer.cycle_collects * schedule.rollout_length
+            found[product] = found.get(product, 0) + trainer.rollouts_per_iteration * schedule.rollout_length
     return found
 
 
-def _update(trainer: Trainer, group: Group) -> Iterator[tuple[Product, float]]:
+def _update(trainer: TrainLoop, group: Group) -> Iterator[tuple[Product, float]]:
     """(product, how many an update) of one agent of the group: see `core.losses`."""
     layout, algorithm = trainer.layout, group.algorithm
     batch = trainer.schedule.batch_size // trainer.devices_per_seed
@@ -161,15 +162,19 @@ def _batched(product: Product, together: int) -> Product:
     return Product(f"n{left},n{right}->n{out}", (together, *product.left), (together, *product.right))
 
 
-def least_bytes(trainer: Trainer, part: str = "loop") -> int:
-    """Bytes of one cycle, all seeds, that cannot stay in a cache: minibatches read from the replay, new rows written,
-    networks and optimisers read and written once an update (twice for what is moved along)."""
+def least_bytes(trainer: TrainLoop, part: str = "loop") -> int:
+    """Bytes of one iteration, all seeds, that cannot stay in a cache: minibatches read from the replay, new rows
+    written, networks and optimisers read and written once an update (twice for what is moved along)."""
     schedule, layout = trainer.schedule, trainer.layout
     batches = 1 if schedule.shared_minibatch else layout.num_agents
     state = memory.size(trainer.abstract_state().groups) // trainer.rows
-    written = 4 * layout.row_size * schedule.collect_steps
+    written = 4 * layout.row_size * schedule.rollout_steps
     read = schedule.updates_per_collect * (4 * layout.row_size * batches * schedule.batch_size + 2 * state)
-    return trainer.rows * trainer.cycle_collects * {"rollout": written, "update": read, "loop": written + read}[part]
+    return (
+        trainer.rows
+        * trainer.rollouts_per_iteration
+        * {"rollout": written, "update": read, "loop": written + read}[part]
+    )
 
 
 # ---- counted in the compiled program ---------------------------------------------------------------------------------
@@ -220,20 +225,20 @@ def _numbers(text: str) -> list[int]:
     return [int(n) for n in text.split(",") if n]
 
 
-def compiled_flops(trainer: Trainer) -> float:
-    """`counted_flops` of one cycle of all seeds. On accelerators, where products are calls into libraries, those of the
-    traced program."""
+def compiled_flops(trainer: TrainLoop) -> float:
+    """`counted_flops` of one iteration of all seeds. On accelerators, where products are calls into libraries, those of
+    the traced program."""
     state = trainer.abstract_state()
     shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.layout.row_size)
     state = state._replace(replay=jax.ShapeDtypeStruct(shape, jnp.float32))
-    cycles = 2  # a loop that runs once may be unrolled
-    traced = trainer.chunk(cycles).jitted.trace(state, trainer.hyper)
+    iterations = 2  # a loop that runs once may be unrolled
+    traced = trainer.interval(iterations).jitted.trace(state, trainer.hyper)
     if not trainer.on_cpu:
-        return product_flops(traced.jaxpr.jaxpr) / cycles
+        return product_flops(traced.jaxpr.jaxpr) / iterations
     # What LLVM does afterwards changes no product.
     quick = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
     text = traced.lower().compile(quick).as_text()
-    return counted_flops(text) / cycles * trainer.mesh.size
+    return counted_flops(text) / iterations * trainer.mesh.size
 
 
 # ---- measured --------------------------------------------------------------------------------------------------------
@@ -294,8 +299,8 @@ def _median(call: Callable[[], Any], repeats: int) -> float:
     return float(np.median(times))
 
 
-def floor(trainer: Trainer, repeats: int = 5, part: str = "loop") -> tuple[Floor, list[dict[str, Any]]]:
-    """The floor of one cycle, or of a part of it (see `products`), and a row for every kind of product."""
+def floor(trainer: TrainLoop, repeats: int = 5, part: str = "loop") -> tuple[Floor, list[dict[str, Any]]]:
+    """The floor of one iteration, or of a part of it (see `products`), and a row for every kind of product."""
     devices_used = trainer.mesh.size
     rows = []
     for product, count in products(trainer, part).items():
@@ -315,7 +320,7 @@ def main(argv: Sequence[str]) -> int:
     taken, overrides = config.take(argv, tuple(DEFAULTS))
     options = {**DEFAULTS, **taken}
     settings = config.load([f"seeds={options['seeds']}", "total_steps=100000", "eval_every=0", *overrides])
-    trainer = Training(settings).trainer
+    trainer = TrainingSession(settings).trainer
     report: dict[str, Any] = {"machine": devices.description(), "versions": devices.versions()}
     report |= {"commit": commit(), "settings": list(argv)}
     found, rows = floor(trainer, options["repeats"])
@@ -324,14 +329,14 @@ def main(argv: Sequence[str]) -> int:
         print(f"{shapes:<56} {row['flops'] / row['seconds_alone'] / 1e9:8.1f} GFLOP/s alone "
               f"{row['flops'] / row['seconds_together'] / 1e9:8.1f} each of {trainer.mesh.size} at once   "
               f"{row['count'] * row['seconds_alone'] / found.alone:6.1%} of the floor")  # fmt: skip
-    steps = trainer.num_seeds * trainer.cycle_steps
+    steps = trainer.num_seeds * trainer.iteration_steps
     counted = compiled_flops(trainer)
     report |= {"floor": dataclasses.asdict(found), "products": rows, "flops_in_compiled_program": counted}
     report["env_steps_per_second"] = steps / found.seconds
     print(f"products of one env step: {found.flops / steps / 1e6:.3f} MFLOP by hand, "
           f"{counted / steps / 1e6:.3f} in the compiled program")  # fmt: skip
-    print(f"least time of a cycle ({steps:,} env steps): products {found.alone * 1e3:.2f} ms (devices as when alone; "
-          f"{found.together * 1e3:.2f} all at once), memory {found.moved * 1e3:.2f} ms")  # fmt: skip
+    print(f"least time of an iteration ({steps:,} env steps): products {found.alone * 1e3:.2f} ms (devices as when "
+          f"alone; {found.together * 1e3:.2f} all at once), memory {found.moved * 1e3:.2f} ms")  # fmt: skip
     print(f"at most {steps / found.seconds:,.0f} env steps/s, at {found.gflops:.0f} GFLOP/s")
     if options["out"] is not None:
         Path(options["out"]).write_text(json.dumps(report, indent=1) + "\n")

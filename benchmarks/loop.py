@@ -1,8 +1,8 @@
 """`python -m benchmarks.loop [repeats=5] [seconds=1] [key=value ...]`: the whole loop of one setting, as JSON.
 
-Time of a cycle, counted products, and memory: what XLA says that the compiled chunk takes, and what the process took at
-most. `learning_starts` transitions are played first, so that with learning_starts=replay_capacity the replay is full.
-Other keys are settings of the run. `benchmarks.growth` calls this once for each point.
+Time of an iteration, counted products, and memory: what XLA says that the compiled interval takes, and what the process
+took at most. `learning_starts` transitions are played first, so that with learning_starts=replay_capacity the replay is
+full. Other keys are settings of the run. `benchmarks.growth` calls this once for each point.
 """
 
 import json
@@ -22,11 +22,11 @@ from matd3_jax import config
 from matd3_jax.cli import command
 from matd3_jax.config import Config
 from matd3_jax.runtime import devices
-from matd3_jax.training.loop import Trainer
-from matd3_jax.training.session import Training
+from matd3_jax.training.loop import TrainLoop
+from matd3_jax.training.session import TrainingSession
 
 CYCLES = 2
-"""Of one call of the compiled chunk: how many does not change the program but for a number."""
+"""Of one call of the compiled interval: how many does not change the program but for a number."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -36,14 +36,14 @@ def main(argv: Sequence[str]) -> int:
     calls = loop.calls(float(options.get("seconds", 1.0)))
     times = [loop.cycle_seconds(calls) for _ in range(int(options.get("repeats", 5)))]
     trainer = loop.trainer
-    steps = trainer.num_seeds * trainer.cycle_steps
+    steps = trainer.num_seeds * trainer.iteration_steps
     report = {
         "cycle_seconds": float(np.median(times)),
         "fastest": min(times),
         "slowest": max(times),
         "env_steps_per_second": steps / float(np.median(times)),
         "env_steps_of_a_cycle": steps,
-        "updates_of_a_cycle": trainer.cycle_collects * trainer.schedule.updates_per_collect,
+        "updates_of_a_cycle": trainer.rollouts_per_iteration * trainer.schedule.updates_per_collect,
         "product_flops_of_a_cycle": loop.cycle_flops,
         "compile_seconds": round(loop.compile_seconds, 1),
         "devices": trainer.mesh.size,
@@ -56,23 +56,23 @@ def main(argv: Sequence[str]) -> int:
 
 
 class Loop:
-    """The chunk of a run, compiled, with a state to call it with."""
+    """The interval of a run, compiled, with a state to call it with."""
 
     def __init__(self, settings: Config):
-        training = Training(settings)
+        training = TrainingSession(settings)
         training.check_memory()
         self.trainer = training.trainer
-        self.state, _ = jax.block_until_ready(self.trainer.prefill(self.trainer.init(training.keys())))
+        self.state, _ = jax.block_until_ready(self.trainer.warm_up(self.trainer.init(training.keys())))
         begun = time.perf_counter()
-        chunk = self.trainer.chunk(CYCLES)
-        traced = chunk.jitted.trace(self.state, chunk.hyper)
+        interval = self.trainer.interval(CYCLES)
+        traced = interval.jitted.trace(self.state, interval.hyper)
         self.compiled = traced.lower().compile()
         self.compile_seconds = time.perf_counter() - begun
         self.cycle_flops = product_flops(traced.jaxpr.jaxpr) / CYCLES
-        """Floating point operations of the matrix products of a cycle of all seeds."""
+        """Floating point operations of the matrix products of an iteration of all seeds."""
 
     def cycle_seconds(self, calls: int) -> float:
-        """Seconds of a cycle of all seeds, mean over `calls` of the chunk."""
+        """Seconds of an iteration of all seeds, mean over `calls` of the interval."""
         begun = time.perf_counter()
         for _ in range(calls):
             self.state, _ = self.compiled(self.state, self.trainer.hyper)
@@ -80,13 +80,14 @@ class Loop:
         return (time.perf_counter() - begun) / (calls * CYCLES)
 
     def calls(self, seconds: float) -> int:
-        """How many calls of the chunk take about `seconds`, at least one; tried, so the chunk is warm after it."""
+        """How many calls of the interval take about `seconds`, at least one; tried, so the interval is warm after
+        it."""
         self.cycle_seconds(1)
         return max(1, round(seconds / (CYCLES * self.cycle_seconds(1))))
 
     def memory(self) -> dict[str, int]:
-        """Bytes, over all devices: XLA's count for the compiled chunk (`arguments` hold the replay; what it gives out
-        is written over them) and the replay as computed."""
+        """Bytes, over all devices: XLA's count for the compiled interval (`arguments` hold the replay; what it gives
+        out is written over them) and the replay as computed."""
         found, count = self.compiled.memory_analysis(), self.trainer.mesh.size
         arguments, temporaries = count * found.argument_size_in_bytes, count * found.temp_size_in_bytes
         outputs = count * (found.output_size_in_bytes - found.alias_size_in_bytes)
@@ -98,7 +99,7 @@ class Loop:
         }
 
 
-def copies_in(text: str, trainer: Trainer) -> int:
+def copies_in(text: str, trainer: TrainLoop) -> int:
     """Copies of a device's whole replay in a compiled program (HLO text, as `Compiled.as_text` gives it)."""
     schedule, layout = trainer.schedule, trainer.layout
     local = f"{trainer.local_seeds},{schedule.replay_capacity},{layout.row_size}"

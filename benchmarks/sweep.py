@@ -26,7 +26,7 @@ from matd3_jax.config import Config
 from matd3_jax.runtime import devices
 from matd3_jax.sweep import batching
 from matd3_jax.sweep.search_space import SearchSpace
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 DEFAULTS: dict[str, Any] = {"seeds": 4, "repeats": 5, "steps": 1200, "out": None}
 SWEPT = ("algo.lr=0.01,0.003,0.001", "algo.tau=0.01,0.005", "algo.policy_delay=1,2,3")
@@ -72,24 +72,24 @@ def main(argv: Sequence[str]) -> int:
 
 
 class _Program:
-    """The chunk of runs that share a program, compiled and warm."""
+    """The interval of runs that share a program, compiled and warm."""
 
     def __init__(self, members: list[Config], steps: int):
-        training = Training(members[0], members=members)
+        training = TrainingSession(members[0], members=members)
         trainer = training.trainer
-        self.state, _ = trainer.prefill(trainer.init(training.keys()))
-        cycles = max(1, round(steps / trainer.cycle_steps))
-        self.steps = cycles * trainer.cycle_steps
+        self.state, _ = trainer.warm_up(trainer.init(training.keys()))
+        iterations = max(1, round(steps / trainer.iteration_steps))
+        self.steps = iterations * trainer.iteration_steps
         self.scale = steps / self.steps
         begun = time.monotonic()
-        self.chunk = trainer.chunk(cycles)
-        self.state, _ = jax.block_until_ready(self.chunk(self.state))
+        self.interval = trainer.interval(iterations)
+        self.state, _ = jax.block_until_ready(self.interval(self.state))
         self.compile_seconds = round(time.monotonic() - begun, 1)
 
     def stretch(self) -> float:
         """Seconds for `steps` env steps of every seed."""
         begun = time.monotonic()
-        self.state, _ = jax.block_until_ready(self.chunk(self.state))
+        self.state, _ = jax.block_until_ready(self.interval(self.state))
         return (time.monotonic() - begun) * self.scale
 
 

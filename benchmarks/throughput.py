@@ -31,8 +31,8 @@ from matd3_jax.cli import command
 from matd3_jax.core import replay
 from matd3_jax.errors import UserError
 from matd3_jax.runtime import devices
-from matd3_jax.training.loop import Trainer, TrainState
-from matd3_jax.training.session import Training
+from matd3_jax.training.loop import TrainLoop, TrainState
+from matd3_jax.training.session import TrainingSession
 
 DEFAULTS: dict[str, Any] = {"seeds": [1, 4, 20], "repeats": 5, "seconds": 1.0, "out": None}
 
@@ -76,19 +76,19 @@ def measure(
     """Rows of the table for one number of seeds; `wanted`: the parts to measure, default all."""
     # Replay no larger than a short run needs: its size does not change the work, only the memory.
     settings = config.load([f"seeds={seeds}", "total_steps=100000", "eval_every=0", *overrides])
-    training = Training(settings)
+    training = TrainingSession(settings)
     training.check_memory()
     trainer = training.trainer
     state, _ = training.start()
     rows = []
-    for part, cycle in parts(trainer).items():
+    for part, iteration in parts(trainer).items():
         if wanted is not None and part not in wanted:
             continue
         # Cycles in one call: first a guess, then as many as take the wanted time; where compiling is dear (robots), the
         # guess is called again and again instead.
-        cycles, calls, compile_seconds = 2, 1, None
+        iterations, calls, compile_seconds = 2, 1, None
         for attempt in range(2):
-            program = trainer.program(cycle, cycles)
+            program = trainer.program(iteration, iterations)
             begun = time.perf_counter()
             state = jax.block_until_ready(program(state)[0])
             if attempt == 0:
@@ -99,7 +99,7 @@ def measure(
             if attempt == 0 and compile_seconds > 10:
                 calls = max(1, round(wanted_calls))
                 break
-            cycles = max(2, round(cycles * wanted_calls))
+            iterations = max(2, round(iterations * wanted_calls))
         least = [_floor(trainer, part)]
         times = []
         for _ in range(repeats):
@@ -108,10 +108,10 @@ def measure(
                 state = program(state)[0]
             jax.block_until_ready(state)
             times.append((time.perf_counter() - begun) / calls)
-        cycles = program.cycles
+        iterations = program.iterations
         least.append(_floor(trainer, part))
-        steps = seeds * cycles * trainer.cycle_steps
-        updates = seeds * cycles * trainer.cycle_collects * trainer.schedule.updates_per_collect
+        steps = seeds * iterations * trainer.iteration_steps
+        updates = seeds * iterations * trainer.rollouts_per_iteration * trainer.schedule.updates_per_collect
         rows.append(
             {
                 "seeds": seeds,
@@ -120,26 +120,26 @@ def measure(
                 "slowest": steps / max(times),
                 "fastest": steps / min(times),
                 "updates_per_second": updates / float(np.median(times)) if part in ("update", "loop") else 0.0,
-                "of_floor": float(np.mean(least)) * cycles / float(np.median(times)),
+                "of_floor": float(np.mean(least)) * iterations / float(np.median(times)),
                 "compile_seconds": compile_seconds,
             }
         )
     return rows
 
 
-def _floor(trainer: Trainer, part: str) -> float:
-    """Least seconds of a cycle's part; 0 where there are no products in it."""
+def _floor(trainer: TrainLoop, part: str) -> float:
+    """Least seconds of an iteration's part; 0 where there are no products in it."""
     return limits.floor(trainer, 3, part)[0].seconds if part in ("rollout", "update", "loop") else 0.0
 
 
-def parts(trainer: Trainer) -> dict[str, Callable[[TrainState, Any], Any]]:
-    """What `Trainer.program` repeats for each part of the loop, by the part's name."""
+def parts(trainer: TrainLoop) -> dict[str, Callable[[TrainState, Any], Any]]:
+    """What `TrainLoop.program` repeats for each part of the loop, by the part's name."""
     return {
         "environment": lambda s, h: _env_steps(trainer, s),
         "rollout": lambda s, h: _collects(trainer, s, h),
         "replay": lambda s, h: _gathers(trainer, s, h),
         "update": lambda s, h: _updates(trainer, s, h),
-        "loop": trainer.cycle,
+        "loop": trainer.iteration,
     }
 
 
@@ -162,15 +162,15 @@ def matmul_gflops(repeats: int = 7) -> float:
     return round(2 * jax.device_count() * count * 1024 * 128 * 128 / float(np.median(times[1:])) / 1e9, 1)
 
 
-def _collects(trainer: Trainer, state: TrainState, hyper: Any) -> tuple[TrainState, Any]:
+def _collects(trainer: TrainLoop, state: TrainState, hyper: Any) -> tuple[TrainState, Any]:
     episodes = None
-    for _ in range(trainer.cycle_collects):
-        state, episodes = trainer.collect(state, hyper)
+    for _ in range(trainer.rollouts_per_iteration):
+        state, episodes = trainer.rollout(state, hyper)
     return state, episodes
 
 
-def _env_steps(trainer: Trainer, state: TrainState) -> tuple[TrainState, Any]:
-    """The env steps of one cycle and nothing else; no episode ends."""
+def _env_steps(trainer: TrainLoop, state: TrainState) -> tuple[TrainState, Any]:
+    """The env steps of one iteration and nothing else; no episode ends."""
     chosen = [trainer.layout.policy(agent) for agent in range(trainer.layout.num_agents)]
     keys = jax.random.split(jax.random.key(0), (state.key.shape[0], trainer.schedule.num_envs))
 
@@ -179,17 +179,17 @@ def _env_steps(trainer: Trainer, state: TrainState) -> tuple[TrainState, Any]:
         after = trainer.env.step(key, env_state, action)
         return after.state, after.reward.sum() + sum(part.sum() for part in after.observation)
 
-    steps = trainer.cycle_collects * trainer.schedule.rollout_length
+    steps = trainer.rollouts_per_iteration * trainer.schedule.rollout_length
     inner, sums = jax.lax.scan(lambda s, _: jax.vmap(jax.vmap(one))(s, keys), state.env.state, length=steps)
     return state._replace(env=state.env._replace(state=inner)), sums.sum(axis=0)
 
 
-def _gathers(trainer: Trainer, state: TrainState, hyper: Any) -> tuple[TrainState, Any]:
-    """The minibatches of one cycle, read and summed."""
+def _gathers(trainer: TrainLoop, state: TrainState, hyper: Any) -> tuple[TrainState, Any]:
+    """The minibatches of one iteration, read and summed."""
     schedule = trainer.schedule
-    count = trainer.cycle_collects * schedule.updates_per_collect
+    count = trainer.rollouts_per_iteration * schedule.updates_per_collect
     batches = 1 if schedule.shared_minibatch else trainer.layout.num_agents
-    size = replay.filled(schedule.replay_capacity, schedule.collect_steps, state.collects)
+    size = replay.filled(schedule.replay_capacity, schedule.rollout_steps, state.rollouts)
     keys = jax.vmap(lambda key: jax.random.split(key, count + 1))(state.key)
 
     def one(args):
@@ -205,9 +205,9 @@ def _gathers(trainer: Trainer, state: TrainState, hyper: Any) -> tuple[TrainStat
     return state._replace(key=keys[:, 0]), sums.sum(axis=1)
 
 
-def _updates(trainer: Trainer, state: TrainState, hyper: Any) -> tuple[TrainState, Any]:
+def _updates(trainer: TrainLoop, state: TrainState, hyper: Any) -> tuple[TrainState, Any]:
     metrics = None
-    for c in range(trainer.cycle_collects):
+    for c in range(trainer.rollouts_per_iteration):
         state, metrics = trainer.learn(state, hyper, first=c * trainer.schedule.updates_per_collect)
     return state, metrics
 

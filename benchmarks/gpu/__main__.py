@@ -5,14 +5,14 @@
 Parts, in this order; docs/performance.md says what each takes:
     check       one update against the CPU's, single Ant steps against C MuJoCo, no copy of the replay in the loop
     wall_clock  20 seeds x 60,000 episodes of simple_spread, and their returns beside the CPU's
-    floor       the least time of a cycle: its products and bytes at the device's own rates
-    launches    kernels of a cycle, and the share of the time in which none runs
+    floor       the least time of an iteration: its products and bytes at the device's own rates
+    launches    kernels of an iteration, and the share of the time in which none runs
     seeds       env steps/s over 1 to 1,024 seeds: whole loop, update, rollout
     precision   float32 products beside the device's own (TF32), wall_clock too
     ant         whole loop of six seeds over environments, its launches, the physics alone, mjx and mjx_fast
     ant_wide    six seeds x 1M env steps of the Ant with recipe=wide, and what they learn
     unroll      longer bodies of the loops
-    draws       random number generators, one draw a cycle
+    draws       random number generators, one draw an iteration
     options     command buffers, autotuning
 Everything is kept in DIR/report.json after each case, and what is there is not measured again: a run that was cut off
 goes on where it stood, and parts can be run one by one. No case begins after `minutes`. A check that fails stops
@@ -56,7 +56,7 @@ def main(argv: Sequence[str]) -> int:
     report = Report(out, minutes)
     for key, value in report.facts.items():
         print(f"{key}: {value}", flush=True)
-    length = Length() if scale >= 1 else Length(cycles=2, seconds=max(0.02, scale), repeats=2)
+    length = Length() if scale >= 1 else Length(iterations=2, seconds=max(0.02, scale), repeats=2)
     for part in PARTS:
         if part in parts:
             PARTS[part](report, scale, length)

@@ -11,7 +11,7 @@ SEEDS, STEPS = 6, 1_000_000
 
 def run(report: Report, scale: float, length: Length) -> None:
     """What decides about the target comes first: the loop with physics=mjx."""
-    few = length._replace(cycles=min(length.cycles, 5))
+    few = length._replace(iterations=min(length.iterations, 5))
     seeds = SEEDS if scale >= 1 else 1
     # 20 environments are what HARL trains with.
     for num_envs in (128, 20, 1024) if scale >= 1 else (20,):

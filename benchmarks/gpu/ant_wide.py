@@ -10,7 +10,7 @@ from benchmarks.gpu.stretch import Length
 from experiments import evaluations, figures, tidy
 from experiments.tidy import Table
 from matd3_jax import config
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 SEEDS, STEPS = 6, 1_000_000
 COLUMNS = ("seed", "step", "updates", *evaluations.COLUMNS)
@@ -32,11 +32,11 @@ def settings(scale: float) -> list[str]:
 
 def measure(report: Report, scale: float) -> Row:
     """Seconds of the whole training, compilation apart. The evaluations go to ant_wide.csv and ant_wide.png."""
-    training = Training(config.load(settings(scale)))
+    training = TrainingSession(config.load(settings(scale)))
     begun = time.perf_counter()
     state, row = training.start()
     rows = [row]
-    for _ in range(training.num_chunks):
+    for _ in range(training.num_intervals):
         state, row = training.advance(state)
         rows.append(row)
     jax.block_until_ready(state)

@@ -10,7 +10,7 @@ from benchmarks.gpu.report import Report, Row
 from benchmarks.loop import copies_in
 from matd3_jax import config, envs
 from matd3_jax.core import update
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 RECORDED = Path(__file__).parents[2] / "tests" / "data" / "ant"
 
@@ -53,7 +53,7 @@ def update_error(precision: str | None) -> Row:
     """How far one MATD3 update on this device is from the same on the CPU, as a part of the update's length: norms
     over all weights of all critics. (Adam's first step is about lr in the direction of each gradient's sign, which
     rounding may turn round where a gradient is next to 0: the largest difference would say little.)"""
-    training = Training(config.load(["seeds=1", "total_steps=100000"]))
+    training = TrainingSession(config.load(["seeds=1", "total_steps=100000"]))
     layout, hyper = training.layout, [training.config.algo.hyper_params()]
     before, after = [], []
     for device, kind in ((jax.devices()[0], precision), (jax.devices("cpu")[0], "highest")):
@@ -73,12 +73,12 @@ def _flat(tree) -> np.ndarray:
 
 
 def replay_copies() -> int:
-    """Copies of the whole replay in the optimised program of a chunk."""
-    trainer = Training(config.load(["seeds=4", "total_steps=100000"])).trainer
+    """Copies of the whole replay in the optimised program of an interval."""
+    trainer = TrainingSession(config.load(["seeds=4", "total_steps=100000"])).trainer
     state = trainer.abstract_state()
     shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.layout.row_size)
     state = state._replace(replay=jax.ShapeDtypeStruct(shape, jnp.float32))
-    text = trainer.chunk(3).jitted.lower(state, trainer.hyper).compile().as_text()
+    text = trainer.interval(3).jitted.lower(state, trainer.hyper).compile().as_text()
     return copies_in(text, trainer)
 
 

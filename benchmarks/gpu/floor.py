@@ -1,20 +1,21 @@
-"""What the device can do at most: how long a cycle must take, from its products and its bytes (`benchmarks.limits`)."""
+"""What the device can do at most: how long an iteration must take, from its products and its bytes
+(`benchmarks.limits`)."""
 
 from benchmarks import limits
 from benchmarks.gpu import seeds
 from benchmarks.gpu.report import Report, Row
 from matd3_jax import config
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 
 def run(report: Report, scale: float) -> None:
     for count in (20, 1024) if scale >= 1 else (2,):
-        report.case("floor", f"{count} seeds", lambda c=count: cycle(c))
+        report.case("floor", f"{count} seeds", lambda c=count: iteration(c))
 
 
-def cycle(count: int) -> Row:
-    """The floor of a cycle of simple_spread at the paper's settings."""
-    trainer = Training(config.load(seeds.settings(count, 100_000))).trainer
+def iteration(count: int) -> Row:
+    """The floor of an iteration of simple_spread at the paper's settings."""
+    trainer = TrainingSession(config.load(seeds.settings(count, 100_000))).trainer
     found, products = limits.floor(trainer, repeats=3)
     return {
         "products_seconds": found.alone,

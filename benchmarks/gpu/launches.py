@@ -1,4 +1,4 @@
-"""What the device does between two launches: kernels of a cycle, and the share of the time in which none runs."""
+"""What the device does between two launches: kernels of an iteration, and the share of the time in which none runs."""
 
 import re
 import tempfile
@@ -23,7 +23,7 @@ TOP = 12
 
 def run(report: Report, scale: float, length: Length) -> None:
     counts = (20, 1024) if scale >= 1 else (2,)
-    few = length._replace(cycles=min(length.cycles, 5))
+    few = length._replace(iterations=min(length.iterations, 5))
     for count in counts:
         capacity = 100_000 if scale >= 1 else 10_000
         line = seeds.settings(count, capacity)
@@ -38,18 +38,18 @@ def measure(overrides: list[str], length: Length) -> Row:
     leave, and "idle_traced" that of the traced stretch.
     """
     at = stretch.setting(overrides)
-    program = stretch.compiled(at, "loop", length.cycles)
+    program = stretch.compiled(at, "loop", length.iterations)
     state, row = stretch.timed(program, at.state, length)
     seen = trace(program, state)
     if seen is None:
         return {"cycle_seconds": row["cycle_seconds"], "device_stream": "none in the trace: no launches to count"}
-    busy = seen.pop("busy_seconds") / program.cycles
+    busy = seen.pop("busy_seconds") / program.iterations
     return {
         "cycle_seconds": row["cycle_seconds"],
         "busy_seconds_per_cycle": busy,
         "idle": max(0.0, 1 - busy / row["cycle_seconds"]),
-        "kernels_per_cycle": seen.pop("kernels") / program.cycles,
-        "copies_per_cycle": seen.pop("copies") / program.cycles,
+        "kernels_per_cycle": seen.pop("kernels") / program.iterations,
+        "copies_per_cycle": seen.pop("copies") / program.iterations,
         **seen,
     }
 

@@ -6,8 +6,8 @@ from benchmarks.gpu.stretch import Length
 from matd3_jax import config
 from matd3_jax.runtime import devices
 from matd3_jax.training import memory
-from matd3_jax.training.loop import Trainer
-from matd3_jax.training.session import Training
+from matd3_jax.training.loop import TrainLoop
+from matd3_jax.training.session import TrainingSession
 
 REPLAY = 1_000_000
 """The paper's."""
@@ -41,21 +41,21 @@ def settings(seeds: int, capacity: int) -> list[str]:
 
 
 def plan(seeds: int, free: int, most: int = REPLAY) -> int:
-    """Transitions a seed that fit into `free` bytes beside everything else, at most `most`; in whole collects.
+    """Transitions a seed that fit into `free` bytes beside everything else, at most `most`; in whole rollouts.
 
     Row by row the work is the same with a smaller replay, so it is made as small as the memory asks for, and reported.
     """
-    trainer = Training(config.load(settings(seeds, 100_000))).trainer
+    trainer = TrainingSession(config.load(settings(seeds, 100_000))).trainer
     return fitting(trainer, SHARE * free, most)
 
 
-def fitting(trainer: Trainer, budget: float, most: int) -> int:
+def fitting(trainer: TrainLoop, budget: float, most: int) -> int:
     """Rows of each seed's replay that fit into `budget` bytes: what all seeds' states and one update of those that are
     updated together leave. Raises ValueError where not even a minibatch fits."""
     together = trainer.mesh.size if trainer.on_cpu else trainer.rows
     beside = trainer.rows * memory.seed_bytes(trainer) + together * memory.update_bytes(trainer)
     rows = int((budget - beside) // (4 * trainer.rows * trainer.layout.row_size))
-    collect = trainer.schedule.collect_steps
+    collect = trainer.schedule.rollout_steps
     capacity = min(rows, most) // collect * collect
     if capacity < trainer.schedule.batch_size:
         raise ValueError(

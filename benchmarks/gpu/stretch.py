@@ -1,4 +1,4 @@
-"""Time for a number of cycles of the loop or of a part of it, one compilation a case."""
+"""Time for a number of iterations of the loop or of a part of it, one compilation a case."""
 
 import time
 from collections.abc import Callable
@@ -11,14 +11,14 @@ import numpy as np
 from benchmarks import throughput
 from benchmarks.gpu.report import Row
 from matd3_jax import config
-from matd3_jax.training.loop import Trainer, TrainState
-from matd3_jax.training.session import Training
+from matd3_jax.training.loop import TrainLoop, TrainState
+from matd3_jax.training.session import TrainingSession
 
 
 class Length(NamedTuple):
     """How long to measure."""
 
-    cycles: int = 10
+    iterations: int = 10
     """Of one call of the program."""
     seconds: float = 1.0
     """Of one timed stretch of calls."""
@@ -28,7 +28,7 @@ class Length(NamedTuple):
 class Setting(NamedTuple):
     """A trainer with a state to measure on."""
 
-    trainer: Trainer
+    trainer: TrainLoop
     state: TrainState
     """Taken over by what is measured."""
 
@@ -36,17 +36,17 @@ class Setting(NamedTuple):
 def setting(overrides: list[str], unroll: int = 1, unroll_steps: int = 1) -> Setting:
     """What `matd3_jax.train` would run, its replay full as for most of a long run: of random numbers, as playing that
     many rows would take too long."""
-    training = Training(config.load([*overrides, "eval_every=0"]))
+    training = TrainingSession(config.load([*overrides, "eval_every=0"]))
     training.check_memory()
     trainer = training.trainer
     trainer.unroll, trainer.unroll_steps = unroll, unroll_steps
     return Setting(trainer, fill(trainer, trainer.init(training.keys())))
 
 
-def fill(trainer: Trainer, state: TrainState) -> TrainState:
+def fill(trainer: TrainLoop, state: TrainState) -> TrainState:
     """The state with every row of the replay uniform on [0, 1), written block by block: no second replay is needed."""
     schedule = trainer.schedule
-    block = schedule.collect_steps
+    block = schedule.rollout_steps
 
     def write(i, rows):
         new = jax.random.uniform(jax.random.fold_in(jax.random.key(0), i), (rows.shape[0], block, rows.shape[2]))
@@ -59,32 +59,32 @@ def fill(trainer: Trainer, state: TrainState) -> TrainState:
         in_shardings=trainer.shardings.replay,
         out_shardings=trainer.shardings.replay,
     )
-    collects = jax.device_put(jnp.int32(count), trainer.shardings.collects)
-    return state._replace(replay=program(state.replay), collects=collects)
+    rollouts = jax.device_put(jnp.int32(count), trainer.shardings.rollouts)
+    return state._replace(replay=program(state.replay), rollouts=rollouts)
 
 
 class Compiled(NamedTuple):
-    """A program of some cycles."""
+    """A program of some iterations."""
 
     run: Any
     """As JAX compiles it ahead of time."""
     part: str
-    trainer: Trainer
-    cycles: int
+    trainer: TrainLoop
+    iterations: int
     compile_seconds: float
 
     def __call__(self, state: TrainState) -> TrainState:
         return self.run(state, self.trainer.hyper)[0]
 
 
-def compiled(at: Setting, part: str, cycles: int, options: dict[str, Any] | None = None) -> Compiled:
+def compiled(at: Setting, part: str, iterations: int, options: dict[str, Any] | None = None) -> Compiled:
     """The program that repeats a part of `throughput.parts`, compiled with XLA's `options` in addition to the flags of
     the process."""
     trainer = at.trainer
-    program = trainer.program(throughput.parts(trainer)[part], cycles)
+    program = trainer.program(throughput.parts(trainer)[part], iterations)
     begun = time.perf_counter()
     run = program.jitted.lower(at.state, trainer.hyper).compile(compiler_options=options)
-    return Compiled(run, part, trainer, cycles, time.perf_counter() - begun)
+    return Compiled(run, part, trainer, iterations, time.perf_counter() - begun)
 
 
 def timed(program: Compiled, state: TrainState, length: Length) -> tuple[TrainState, Row]:
@@ -96,17 +96,17 @@ def timed(program: Compiled, state: TrainState, length: Length) -> tuple[TrainSt
         for _ in range(calls):
             state = program(state)
         jax.block_until_ready(state)
-        return state, (time.perf_counter() - begun) / (calls * program.cycles)
+        return state, (time.perf_counter() - begun) / (calls * program.iterations)
 
     state, _ = stretch(state)  # the first call loads kernels
-    state, cycle = stretch(state)
-    calls = max(1, round(length.seconds / (cycle * program.cycles)))
+    state, iteration = stretch(state)
+    calls = max(1, round(length.seconds / (iteration * program.iterations)))
     times = []
     for _ in range(length.repeats):
-        state, cycle = stretch(state)
-        times.append(cycle)
-    steps = trainer.num_seeds * trainer.cycle_steps
-    updates = trainer.num_seeds * trainer.cycle_collects * trainer.schedule.updates_per_collect
+        state, iteration = stretch(state)
+        times.append(iteration)
+    steps = trainer.num_seeds * trainer.iteration_steps
+    updates = trainer.num_seeds * trainer.rollouts_per_iteration * trainer.schedule.updates_per_collect
     memory = program.run.memory_analysis()
     row = {
         "seeds": trainer.num_seeds,
@@ -127,7 +127,7 @@ def measure(
 ) -> Row:
     """One row: a part of the loop at some settings."""
     at = setting(overrides, **unroll)
-    program = compiled(at, part, length.cycles, options)
+    program = compiled(at, part, length.iterations, options)
     return timed(program, at.state, length)[1]
 
 

@@ -43,12 +43,12 @@ def verdict(what: str, value: str, met: bool, target: str, full: bool = True) ->
 
 
 def bound(report: Report, seeds: int) -> list[str]:
-    """What is known of where the time of a cycle goes with so many seeds of simple_spread."""
+    """What is known of where the time of an iteration goes with so many seeds of simple_spread."""
     found = shares(report.get("launches", f"simple_spread, {seeds} seeds"))
     floor = report.get("floor", f"{seeds} seeds")
     if floor is not None:
         found.append(
-            f"  floor of a cycle: {1e3 * floor['products_seconds']:.2f} ms of products, each at its own shape "
+            f"  floor of an iteration: {1e3 * floor['products_seconds']:.2f} ms of products, each at its own shape "
             f"({floor['flops'] / floor['products_seconds'] / 1e12:.3g} TFLOP/s), {1e3 * floor['bytes_seconds']:.2f} ms "
             "of memory traffic at least"
         )
@@ -62,14 +62,15 @@ def shares(row: Row | None) -> list[str]:
         return [f"  launches: {row['device_stream']}"]
     whole, busy = 1e3 * row["cycle_seconds"], 1e3 * row["busy_seconds_per_cycle"]
     return [
-        f"  a cycle takes {whole:.2f} ms, {busy:.2f} of them with a kernel running ({row['kernels_per_cycle']:.0f} "
-        f"kernels, {row['copies_per_cycle']:.0f} copies); the rest, {row['idle']:.0%}, waits for launches"
+        f"  an iteration takes {whole:.2f} ms, {busy:.2f} of them with a kernel running "
+        f"({row['kernels_per_cycle']:.0f} kernels, {row['copies_per_cycle']:.0f} copies); "
+        f"the rest, {row['idle']:.0%}, waits for launches"
     ]
 
 
 def table(report: Report) -> list[str]:
     """All rates, a line for each case."""
-    found = [f"{'part':<10} {'case':<55} {'env steps/s':>12} {'updates/s':>10} {'ms a cycle':>10} {'compiled, s':>11}"]
+    found = [f"{'part':<10} {'case':<55} {'env steps/s':>12} {'updates/s':>10} {'ms/iter':>10} {'compiled, s':>11}"]
     for part in report.parts:
         for name, row in report.parts[part].items():
             if "failed" in row:

@@ -13,7 +13,7 @@ from benchmarks.gpu.checks import PRECISIONS
 from benchmarks.gpu.report import Report, Row
 from benchmarks.gpu.stretch import Length
 from matd3_jax import config
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 COMMANDS = "FUSION,CUBLAS,CUBLASLT,CUSTOM_CALL,CUDNN,DYNAMIC_SLICE_FUSION"
 """What XLA puts into command buffers (CUDA graphs) by default, where at least five of them follow each other."""
@@ -32,7 +32,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 UNROLL: dict[str, dict[str, int]] = {
     "as it is": {},
-    "2 cycles": {"unroll": 2},
+    "2 iterations": {"unroll": 2},
     "5 steps": {"unroll_steps": 5},
     "25 steps": {"unroll_steps": 25},
 }
@@ -68,7 +68,7 @@ def draws(report: Report, scale: float, length: Length) -> None:
         context = partial(jax.default_prng_impl, name)
         _case(report, "draws", f"loop, {name}", line(scale), length, context)
         for large in (False, True):
-            case = f"random numbers alone, {name}, {'one draw a cycle' if large else 'as in the loop'}"
+            case = f"random numbers alone, {name}, {'one draw an iteration' if large else 'as in the loop'}"
             report.case("draws", case, lambda c=context, b=large: draw(line(scale), b, length.seconds, c))
 
 
@@ -89,10 +89,10 @@ def _case(
 
 
 def draw(overrides: list[str], large: bool, seconds: float, context: Callable[[], AbstractContextManager]) -> Row:
-    """Seconds for as many Gumbel numbers as a cycle of all seeds takes: in a draw for each use of each update and
+    """Seconds for as many Gumbel numbers as an iteration of all seeds takes: in a draw for each use of each update and
     collect, or in one for each seed."""
     with context():
-        training = Training(config.load(overrides))
+        training = TrainingSession(config.load(overrides))
         sizes = drawn(training)
         repeats, sizes = 20, [sum(sizes)] if large else sizes
 
@@ -100,26 +100,26 @@ def draw(overrides: list[str], large: bool, seconds: float, context: Callable[[]
             keys = jax.random.split(key, len(sizes) + 1)
             return keys[0], sum(jax.random.gumbel(k, (n,)).max() for k, n in zip(keys[1:], sizes, strict=True))
 
-        def cycles(keys, sums):
-            def cycle(carry, _):
+        def iterations(keys, sums):
+            def iteration(carry, _):
                 keys, new = jax.vmap(one)(carry[0])
                 return (keys, carry[1] + new), None
 
-            return jax.lax.scan(cycle, (keys, sums), length=repeats)[0]
+            return jax.lax.scan(iteration, (keys, sums), length=repeats)[0]
 
-        program = jax.jit(cycles)
+        program = jax.jit(iterations)
         keys = training.keys()
         rate = stretch.rate(lambda carry: program(*carry), (keys, jnp.zeros(len(keys))), seconds)
     return {"seeds": len(keys), "numbers_per_cycle": len(keys) * sum(sizes), "cycle_seconds": 1 / (rate * repeats)}
 
 
-def drawn(training: Training) -> Sequence[int]:
-    """How many numbers each draw of one seed's cycle holds: those of each update (minibatches, target actions for every
-    agent, own actions) and of each collect."""
+def drawn(training: TrainingSession) -> Sequence[int]:
+    """How many numbers each draw of one seed's iteration holds: those of each update (minibatches, target actions for
+    every agent, own actions) and of each rollout."""
     layout, schedule, trainer = training.layout, training.trainer.schedule, training.trainer
     batch, agents = schedule.batch_size, layout.num_agents
     update = [agents * batch, agents * batch * layout.action_size, batch * layout.action_size]
-    return trainer.cycle_collects * [
+    return trainer.rollouts_per_iteration * [
         *schedule.updates_per_collect * update,
-        schedule.collect_steps * layout.action_size,
+        schedule.rollout_steps * layout.action_size,
     ]

@@ -12,7 +12,7 @@ from experiments import figures, tidy
 from experiments.tidy import Table
 from matd3_jax import config
 from matd3_jax.stats import intervals
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 RECORDED = Path(__file__).parents[2] / "experiments" / "results" / "cooperative" / "data.csv"
 """Ten seeds of the same, trained on a CPU."""
@@ -39,14 +39,14 @@ def measure(name: str, precision: str | None, scale: float, out: Path) -> Row:
     seeds, steps = (SEEDS, STEPS) if scale >= 1 else (2, max(30_000, round(STEPS * scale)))
     line = ["env=simple_spread", "algo=matd3", f"seeds={seeds}", f"total_steps={steps}", f"log_every={LOG_EVERY}"]
     with jax.default_matmul_precision(precision):
-        training = Training(config.load([*line, "eval_every=0"]))
+        training = TrainingSession(config.load([*line, "eval_every=0"]))
         begun = time.perf_counter()
         jax.block_until_ready(training.advance(training.start()[0])[0])
         first = time.perf_counter() - begun
         begun = time.perf_counter()
         state, row = training.start()
-        rows, prefill = [row], time.perf_counter() - begun
-        for _ in range(training.num_chunks):
+        rows, warm_up = [row], time.perf_counter() - begun
+        for _ in range(training.num_intervals):
             state, row = training.advance(state)
             rows.append(row)
         jax.block_until_ready(state)
@@ -54,13 +54,13 @@ def measure(name: str, precision: str | None, scale: float, out: Path) -> Row:
     columns = ("seed", "step", "updates", "episodes", RETURN)
     table = Table({key: np.concatenate([row[key] for row in rows]) for key in columns})
     tidy.write(table, out / f"simple_spread_{name}.csv")
-    chunk = (seconds - prefill) / training.num_chunks
+    interval = (seconds - warm_up) / training.num_intervals
     return {
         "seeds": seeds,
         "episodes": training.total_steps // 25,
         "seconds": seconds,
-        "prefill_seconds": prefill,
-        "compile_seconds": max(0.0, first - prefill - chunk),
+        "warm_up_seconds": warm_up,
+        "compile_seconds": max(0.0, first - warm_up - interval),
         "env_steps_per_second": seeds * training.total_steps / seconds,
         "returns": beside(table, recorded()),
     }

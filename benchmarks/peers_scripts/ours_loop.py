@@ -8,7 +8,7 @@ import serve
 
 from matd3_jax import config
 from matd3_jax.runtime import devices
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 COMMON = ("eval_every=0", "total_steps=1000000")
 
@@ -17,16 +17,16 @@ def prepare(case: dict) -> serve.Stretch:
     """Prefilled and compiled; a stretch is one call of the program, all seeds counted."""
     devices.prepare()
     settings = config.load([*COMMON, *case["settings"]])
-    training = Training(settings)
+    training = TrainingSession(settings)
     trainer = training.trainer
     kept = [training.start()[0]]
-    cycles = max(1, round(case["steps"] / trainer.cycle_steps))
-    chunk = trainer.chunk(cycles)
+    cycles = max(1, round(case["steps"] / trainer.iteration_steps))
+    chunk = trainer.interval(cycles)
 
     def stretch() -> int:
         state = kept.pop()  # the program reuses its memory
         kept.append(jax.block_until_ready(chunk(state)[0]))
-        return settings.seeds * cycles * trainer.cycle_steps
+        return settings.seeds * cycles * trainer.iteration_steps
 
     return stretch
 

@@ -2,7 +2,7 @@
 
 from matd3_jax import envs
 from matd3_jax.errors import UserError
-from matd3_jax.training.session import Result, Training, train
+from matd3_jax.training.session import Result, TrainingSession, train
 
 __version__ = "0.1.0"
-__all__ = ["Result", "Training", "UserError", "envs", "train"]
+__all__ = ["Result", "TrainingSession", "UserError", "envs", "train"]

@@ -11,7 +11,7 @@ from benchmarks import compile_times, fresh, growth, growth_figure, guard, loop
 from benchmarks.loop import copies_in
 from matd3_jax import config
 from matd3_jax.errors import UserError
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 
 def point(value, seconds, megabytes=10.0):
@@ -50,10 +50,10 @@ def test_points_of_the_growth_study_are_possible():
 
 
 def test_counted_products():
-    """Of a cycle of MATD3 on simple_spread, product by product, for two seeds on two devices."""
+    """Of an iteration of MATD3 on simple_spread, product by product, for two seeds on two devices."""
     agents, batch, hidden = 3, 256, 8
     settings = [f"batch_size={batch}", f"algo.hidden=[{hidden},{hidden}]", "seeds=2", "total_steps=30000"]
-    trainer = Training(config.load(settings)).trainer
+    trainer = TrainingSession(config.load(settings)).trainer
     o, a = 18, 5
     x = agents * (o + a)
 
@@ -72,7 +72,7 @@ def test_counted_products():
     wanted = 2 * 2 * (2 * update + moving + rollout)  # a multiplication and an addition; two seeds
     shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.layout.row_size)
     state = trainer.abstract_state()._replace(replay=jax.ShapeDtypeStruct(shape, jnp.float32))
-    traced = trainer.chunk(3).jitted.trace(state, trainer.hyper)
+    traced = trainer.interval(3).jitted.trace(state, trainer.hyper)
     assert loop.product_flops(traced.jaxpr.jaxpr) / 3 == pytest.approx(wanted, rel=1e-3)
 
 
@@ -92,7 +92,7 @@ def test_guard_fails_on_gross_regressions_only():
 
 
 def test_copies_of_the_replay_are_counted():
-    trainer = Training(config.load(["seeds=2", "total_steps=30000"])).trainer
+    trainer = TrainingSession(config.load(["seeds=2", "total_steps=30000"])).trainer
     shape = f"f32[1,{trainer.schedule.replay_capacity},127]{{2,1,0}}"
     text = f"  %a = {shape} parameter(0)\n  %b = {shape} copy(%a)\n  %c = f32[1,100,127]{{2,1,0}} copy(%d)\n"
     assert copies_in(text, trainer) == 1
@@ -104,9 +104,9 @@ def test_compile_times_reports_medians_and_slow_programs():
         return {"import": 3.0, "programs": dict.fromkeys(compile_times.PROGRAMS, stages), "total": 3 + 4 * scale}
 
     cold = compile_times.median([report(10.0), report(40.0), report(31.0)])
-    assert cold["programs"]["chunk"]["cpu"] == 31.0 and cold["total"] == 127.0
+    assert cold["programs"]["interval"]["cpu"] == 31.0 and cold["total"] == 127.0
     environments = {"simple": {"cold": cold, "warm": report(1.0)}, "ant": {"cold": report(29.0), "warm": report(40.0)}}
-    assert compile_times.slow(environments)[3] == "simple: chunk took 31 s of a core cold, more than 30"
+    assert compile_times.slow(environments)[3] == "simple: interval took 31 s of a core cold, more than 30"
     assert len(compile_times.slow(environments)) == len(compile_times.PROGRAMS)
     assert "33.0 (31.0)" in compile_times.row("simple", "cold", cold)
     with pytest.raises(UserError, match="simple_spraed.*simple_spread"):

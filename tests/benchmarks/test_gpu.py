@@ -12,7 +12,7 @@ from experiments.tidy import Table
 from matd3_jax import config
 from matd3_jax.errors import UserError
 from matd3_jax.training import memory
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 # Times in us. Stream 7: 0-2 and 5-6; stream 8: 1-3, a copy 5.5-7.5. Together 0-3 and 5-7.5: 5.5 of 7.5. Line 3 shows
 # the same again by module; the host's plane is no device.
@@ -58,8 +58,8 @@ def test_covered():
 
 
 def test_replay_plan():
-    """The replay takes what is left, in whole collects: one collect more would not fit."""
-    trainer = Training(config.load(seeds.settings(64, 100_000))).trainer
+    """The replay takes what is left, in whole rollouts: one rollout more would not fit."""
+    trainer = TrainingSession(config.load(seeds.settings(64, 100_000))).trainer
     beside = seeds.fitting(trainer, 1e15, 10**9)
     assert beside == 10**9, "at most what was asked for"
     row, budget = 4 * 127 * trainer.rows, 10e9

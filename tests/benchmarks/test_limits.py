@@ -1,4 +1,5 @@
-"""The least time of a cycle: products counted by hand against those of the compiled program, and how they are timed."""
+"""The least time of an iteration: products counted by hand against those of the compiled program, and how they are
+timed."""
 
 import math
 
@@ -8,7 +9,7 @@ import pytest
 
 from benchmarks import limits
 from matd3_jax import config
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 SMALL = ("total_steps=100", "replay_capacity=100", "learning_starts=100", "batch_size=16", "algo.hidden=[8,6]")
 
@@ -32,7 +33,7 @@ SMALL = ("total_steps=100", "replay_capacity=100", "learning_starts=100", "batch
     ids=str,
 )
 def test_products_by_hand_are_those_of_the_compiled_program(settings):
-    trainer = Training(config.load([*SMALL, *settings])).trainer
+    trainer = TrainingSession(config.load([*SMALL, *settings])).trainer
     by_hand = trainer.mesh.size * sum(n * product.flops for product, n in limits.products(trainer).items())
     parts = [sum(n * p.flops for p, n in limits.products(trainer, part).items()) for part in ("rollout", "update")]
     assert trainer.mesh.size * sum(parts) == pytest.approx(by_hand, rel=1e-12) and min(parts) > 0

@@ -15,7 +15,7 @@ from matd3_jax.errors import UserError
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runs.paths import paths
 from matd3_jax.training import checkpoint
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 pytestmark = pytest.mark.usefixtures("quick_jit")
 
@@ -27,7 +27,7 @@ def saved(tmp_path_factory):
     for name, (training, state) in runs().items():
         directory = RunDirectory.create(folder / name, training.config, {})
         checkpoint.save(directory.checkpoints, 40, training.trainer, state, 1)
-    empty = Training(config.load(SMALL))
+    empty = TrainingSession(config.load(SMALL))
     RunDirectory.create(folder / "empty", empty.config, {})
     other = dataclasses.replace(empty.config, env={**empty.config.env, "num_good": 3})
     RunDirectory.create(folder / "other", other, {})

@@ -304,7 +304,7 @@ def test_together(tmp_path):
 
 
 def test_a_table_that_is_being_written(tmp_path):
-    """Whatever was cut off at the end of the file, only whole chunks are read, with whole numbers."""
+    """Whatever was cut off at the end of the file, only whole intervals are read, with whole numbers."""
     want = make_run(tmp_path / "a", "seeds=3")
     run, _ = RunDirectory.open(tmp_path / "a")
     text = run.metrics.read_bytes()

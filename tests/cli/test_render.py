@@ -19,7 +19,7 @@ from matd3_jax.envs.wrappers.joint_team import JointTeam
 from matd3_jax.errors import UserError
 from matd3_jax.evaluation import trajectory
 from matd3_jax.training import checkpoint
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 from matd3_jax.video import encode, frames
 
 TINY = [
@@ -38,7 +38,7 @@ def run(tmp_path_factory, quick_jit) -> Path:
 
 @pytest.fixture(scope="module")
 def trained(run):
-    training = Training(config.read(run / "config.yaml"))
+    training = TrainingSession(config.read(run / "config.yaml"))
     return training, checkpoint.restore_actors(checkpoint.verify(run / "checkpoints"), training.trainer)
 
 

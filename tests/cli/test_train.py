@@ -14,9 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from matd3_jax import config
 from matd3_jax.cli import command, evaluate, train
 from matd3_jax.errors import UserError
 from matd3_jax.training import checkpoint
+from matd3_jax.training.session import TrainingSession
 
 # A schedule and networks so small that a run takes a second; every part of the real one is there, two teams included.
 TINY = [
@@ -74,11 +76,11 @@ def test_a_run_leaves_all_its_files(whole):
 
 
 def test_the_metrics_table_is_tidy(whole):
-    """One row for each seed and chunk, steps ascending, everything counted."""
+    """One row for each seed and interval, steps ascending, everything counted."""
     table = rows(whole)
     steps = sorted({int(row["step"]) for row in table})
     assert [(int(row["step"]), int(row["seed"])) for row in table] == [(s, seed) for s in steps for seed in range(3)]
-    assert steps[0] == 150 and steps[-1] >= 1500  # prefill: one collect of 50 before 200 transitions are reached
+    assert steps[0] == 150 and steps[-1] >= 1500  # warm-up: one rollout of 50 before 200 transitions are reached
     for row in table:
         # 25-step episodes in two environments: as many have ended as steps were played.
         assert int(row["updates"]) == max(0, int(row["step"]) - 150) // 50
@@ -87,7 +89,7 @@ def test_the_metrics_table_is_tidy(whole):
         assert float(row["return_adversaries"]) == pytest.approx(float(row["adversary_0_return"]))
     assert sum(int(row["episodes"]) for row in table if row["seed"] == "1") == steps[-1] // 25
     evaluated = sorted({int(row["step"]) for row in table if row["eval_return_agents"] != "nan"})
-    assert evaluated == [150, 550, 950, 1350, 1550]  # chunks of 200 from 150 on: 400, 800, 1200, and the end
+    assert evaluated == [150, 550, 950, 1350, 1550]  # intervals of 200 from 150 on: 400, 800, 1200, and the end
     late = [row for row in table if int(row["step"]) > 150]
     assert all(np.isfinite(float(row["agent_0_critic_loss"])) for row in late)
 
@@ -120,7 +122,7 @@ def test_the_announcement(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(train.cost, "physics_rate", lambda *_: None)
 
     def announced(*settings, done=0, recipe=None):
-        training = train.Training(train.config.load([*settings, "seeds=2", "learning_starts=200"]))
+        training = train.TrainingSession(train.config.load([*settings, "seeds=2", "learning_starts=200"]))
         object.__setattr__(training.config, "recipe", recipe)
         train._announce(training, train.RunDirectory(tmp_path / "run"), done)
         return capsys.readouterr().out.splitlines()
@@ -226,6 +228,20 @@ def test_damage_is_named_and_the_checkpoint_before_it_used_on_request(whole, tmp
     assert before == {p: p.stat().st_mtime_ns for p in damaged.rglob("*")}
     assert train.main([f"resume={damaged}", f"checkpoint={found[-2]}"]) == 0
     assert (damaged / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
+
+
+def test_checkpoints_from_before_a_leaf_was_renamed_are_read(whole, monkeypatch):
+    """They hold the count of rollouts under another name."""
+    read, settings = checkpoint.read_state, config.read(whole / "config.yaml")
+    trainer, path = TrainingSession(settings).trainer, checkpoint.verify(whole / "checkpoints")
+    state = checkpoint.restore_actors(path, trainer)
+
+    def before(*args):
+        found = read(*args)
+        return {".collects" if name == ".rollouts" else name: leaf for name, leaf in found.items()}
+
+    monkeypatch.setattr(checkpoint, "read_state", before)
+    assert int(checkpoint.restore_actors(path, trainer).rollouts) == int(state.rollouts) > 0
 
 
 def test_a_missing_checksum_file_is_damage(whole, tmp_path):

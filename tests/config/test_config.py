@@ -8,7 +8,7 @@ import pytest
 
 from matd3_jax import config, envs
 from matd3_jax.errors import UserError
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 PAPER = {
     "actor_lr": 0.01,
@@ -45,7 +45,7 @@ def test_the_default_schedule_is_the_papers():
     assert settings.num_envs * settings.rollout_length == 100 and settings.updates_per_collect == 1
     assert (settings.batch_size, settings.replay_capacity, settings.learning_starts) == (1024, 1_000_000, 25_600)
     assert settings.total_steps == 60_000 * 25
-    trainer = Training(settings).trainer
+    trainer = TrainingSession(settings).trainer
     # 2,245 updates by env step 250,000 (the authors' program), counted through this project's own schedule.
     assert trainer.updates(250_000 // 100) == 2245
 
@@ -202,22 +202,22 @@ def test_every_mistake_gives_one_line_that_names_it(text):
 )
 def test_what_the_environment_does_not_take_is_named(overrides, names):
     with pytest.raises(ValueError, match=names):
-        Training(config.load(overrides))
+        TrainingSession(config.load(overrides))
 
 
 def test_a_replay_that_cannot_fit_is_refused_with_the_arithmetic():
-    training = Training(config.load(["seeds=20000", "total_steps=2000000"]))
+    training = TrainingSession(config.load(["seeds=20000", "total_steps=2000000"]))
     with pytest.raises(UserError, match=r"20000 seeds x 1,000,000 transitions x 127 numbers x 4 bytes = 10160.00 GB"):
         training.check_memory()
 
 
 def test_several_steps_need_one_number_more():
-    one, three = (Training(config.load([f"n_step={n}", "total_steps=100000"])) for n in (1, 3))
+    one, three = (TrainingSession(config.load([f"n_step={n}", "total_steps=100000"])) for n in (1, 3))
     assert (one.layout.row_size, three.layout.row_size) == (127, 128)
     assert "more" not in one.memory and "x 128 numbers" in three.memory and "rewards 3, more 1," in three.memory
 
 
 def test_a_short_run_allocates_no_rows_it_would_never_write():
-    training = Training(config.load(["seeds=2", "total_steps=100000"]))
+    training = TrainingSession(config.load(["seeds=2", "total_steps=100000"]))
     assert training.trainer.schedule.replay_capacity == training.total_steps < 101_000
     assert training.trainer.replay_bytes == 2 * training.total_steps * 127 * 4

@@ -1,5 +1,5 @@
 """n-step returns from the replay against plain Python on the recorded play: several environments, ends of episodes of
-both kinds, collects, the ring's seam and its newest rows."""
+both kinds, rollouts, the ring's seam and its newest rows."""
 
 import dataclasses
 import functools
@@ -13,7 +13,7 @@ from ledger import HYPER, Ledger, by_hand
 from matd3_jax.core import n_step, replay, update
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
-from matd3_jax.training.loop import Trainer
+from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.schedule import Schedule
 
 GAMMAS = (0.7, 0.0)
@@ -50,7 +50,7 @@ def test_successors():
 
 
 def test_successors_far_on():
-    """After a billion collects (count * n overflows int32) the newest row of each environment still has none."""
+    """After a billion rollouts (count * n overflows int32) the newest row of each environment still has none."""
     count = 2**31 - 1
     newest = (count - 1) % 5 * 12 + 11
     _, there = replay.successors(replay.Written(60, 12, jnp.int32(count)), jnp.array([newest, newest - 3]), 3, 3)
@@ -58,15 +58,15 @@ def test_successors_far_on():
 
 
 @functools.cache
-def play(collects):
-    """(trainer, state, rows in the order of play [steps, ENVS, row]) of two seeds after so many collects."""
+def play(rollouts):
+    """(trainer, state, rows in the order of play [steps, ENVS, row]) of two seeds after so many rollouts."""
     hyper = {"agents": HYPER._replace(gamma=GAMMAS[0]), "adversaries": HYPER._replace(gamma=GAMMAS[1])}
-    trainer = Trainer(Ledger(), layout(3), SCHEDULE, hyper, 2, devices=jax.devices()[:1])
-    state, _ = trainer.prefill(trainer.init(jax.vmap(jax.random.key)(jnp.arange(2))))
-    chunk, rows = trainer.chunk(1), [np.asarray(state.replay[:, : 2 * ENVS * LENGTH])]
-    while int(state.collects) < collects:
-        at = int(state.collects) * ENVS * LENGTH % CAPACITY
-        state, _ = chunk(state)
+    trainer = TrainLoop(Ledger(), layout(3), SCHEDULE, hyper, 2, devices=jax.devices()[:1])
+    state, _ = trainer.warm_up(trainer.init(jax.vmap(jax.random.key)(jnp.arange(2))))
+    interval, rows = trainer.interval(1), [np.asarray(state.replay[:, : 2 * ENVS * LENGTH])]
+    while int(state.rollouts) < rollouts:
+        at = int(state.rollouts) * ENVS * LENGTH % CAPACITY
+        state, _ = interval(state)
         rows.append(np.asarray(state.replay[:, at : at + ENVS * LENGTH]))
     played = np.concatenate(rows, axis=1).reshape(2, -1, ENVS, trainer.layout.row_size)
     return trainer, state, played
@@ -85,18 +85,18 @@ def by_python(rows, n):
     raise AssertionError
 
 
-# Two collects: the ring fills up; 5: just full; 8: round once and a half, the seam in the middle.
-@pytest.mark.parametrize("collects", [2, 5, 8])
+# Two rollouts: the ring fills up; 5: just full; 8: round once and a half, the seam in the middle.
+@pytest.mark.parametrize("rollouts", [2, 5, 8])
 @pytest.mark.parametrize("n", [2, 3, 7])
-def test_returns_by_python(n, collects):
+def test_returns_by_python(n, rollouts):
     """For every row in the replay of both seeds: x and actions, rewards, number of steps, x' and discount. n = 7 is
-    longer than an episode and than a collect."""
-    trainer, state, played = play(collects)
+    longer than an episode and than a rollout."""
+    trainer, state, played = play(rollouts)
     steps = played.shape[1]
 
     @jax.jit
     def drawn(seed, indices):
-        written = replay.Written(CAPACITY, SCHEDULE.collect_steps, state.collects)
+        written = replay.Written(CAPACITY, SCHEDULE.rollout_steps, state.rollouts)
         return n_step.draw(layout(n), state.replay, seed, indices, written, ENVS, jnp.array(GAMMAS))
 
     oldest = max(0, steps - CAPACITY // ENVS)
@@ -128,8 +128,8 @@ def test_updates_get_them(monkeypatch):
     monkeypatch.setattr(update, "update", stub)
     trainer, state, played = play(5)
     trainer.schedule = dataclasses.replace(SCHEDULE, batch_size=20_000)
-    state, metrics = trainer.chunk(1)(jax.tree.map(jnp.copy, state))
-    new = np.asarray(state.replay[:, : SCHEDULE.collect_steps]).reshape(2, LENGTH, ENVS, -1)
+    state, metrics = trainer.interval(1)(jax.tree.map(jnp.copy, state))
+    new = np.asarray(state.replay[:, : SCHEDULE.rollout_steps]).reshape(2, LENGTH, ENVS, -1)
     played = np.concatenate([played[:, -CAPACITY // ENVS + LENGTH :], new], axis=1)
     for seed in range(2):
         found = [by_python(played[seed, t:, e], 3) for t in range(CAPACITY // ENVS) for e in range(ENVS)]

@@ -31,7 +31,7 @@ from matd3_jax.errors import UserError
 from matd3_jax.figures import q_bias as q_bias_figure
 from matd3_jax.runs import overestimation
 from matd3_jax.training import checkpoint
-from matd3_jax.training.loop import Trainer
+from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.schedule import Schedule
 
 MATD3 = Algorithm(hidden=(5,), policy_delay=1)  # or else the loop to compile is twice as long
@@ -190,7 +190,7 @@ SCHEDULE = Schedule(num_envs=3, rollout_length=4, batch_size=8, replay_capacity=
 
 def trainer(slots):
     hyper = {"agents": LEDGER_HYPER[0], "adversaries": LEDGER_HYPER[1]}
-    return Trainer(Ledger(), LEDGER, SCHEDULE, hyper, SEEDS, q_bias_pairs=slots)
+    return TrainLoop(Ledger(), LEDGER, SCHEDULE, hyper, SEEDS, q_bias_pairs=slots)
 
 
 def plain(state):
@@ -200,12 +200,12 @@ def plain(state):
 
 @functools.cache
 def run(slots=SLOTS):
-    """(trainer, states, values measured, compilations in the end): states after two collects of prefill, two more, an
+    """(trainer, states, values measured, compilations in the end): states after two rollouts of warm-up, two more, an
     evaluation, two and two more."""
     t = trainer(slots)
-    state, _ = t.prefill(t.init(jax.vmap(jax.random.key)(jnp.arange(SEEDS))))
-    states, chunk, measured = [plain(state)], t.chunk(2), None
-    state, _ = chunk(state)
+    state, _ = t.warm_up(t.init(jax.vmap(jax.random.key)(jnp.arange(SEEDS))))
+    states, interval, measured = [plain(state)], t.interval(2), None
+    state, _ = interval(state)
     states.append(plain(state))
     if slots:
         measured = jax.tree.map(np.asarray, t.measure_q_bias(state, 3))
@@ -215,13 +215,13 @@ def run(slots=SLOTS):
         lambda event, seconds, **_: compilations.append(event) if "backend_compile" in event else None
     )
     for _ in range(2):
-        state, _ = chunk(state)
+        state, _ = interval(state)
         states.append(plain(state))
     return t, states, measured, len(compilations)
 
 
-@pytest.mark.parametrize(("state", "collects"), [(0, (0, 2)), (1, (0, 4)), (2, (4, 6)), (3, (4, 8))])
-def test_the_reservoir_is_uniform_since_the_last_evaluation(state, collects):
+@pytest.mark.parametrize(("state", "rollouts"), [(0, (0, 2)), (1, (0, 4)), (2, (4, 6)), (3, (4, 8))])
+def test_the_reservoir_is_uniform_since_the_last_evaluation(state, rollouts):
     """Each pair is one transition of the replay, state and all; each transition since the last evaluation, and no
     other, is as likely; pairs are drawn one by one, and for each seed anew."""
     states = run()[1]
@@ -231,7 +231,7 @@ def test_the_reservoir_is_uniform_since_the_last_evaluation(state, collects):
         held = jax.tree.map(lambda leaf, s=seed: leaf[s], reservoir.pairs)
         x = np.concatenate(jax.vmap(Ledger().observe)(held.state), axis=1)
         np.testing.assert_array_equal(x, held.inputs[:, :7])
-        first, end = (c * SCHEDULE.collect_steps for c in collects)
+        first, end = (c * SCHEDULE.rollout_steps for c in rollouts)
         rows = states[-1].replay[seed, :, :11]
         place = {row.tobytes(): k for k, row in enumerate(rows)}
         assert len(place) >= end
@@ -261,7 +261,7 @@ def test_measuring_by_seed():
 
 
 def test_training_is_the_same_with_and_without():
-    """Networks, optimisers, replay, environments and keys; without, not a leaf of it. After the prefill to the bit, and
+    """Networks, optimisers, replay, environments and keys; without, not a leaf of it. After the warm-up to the bit, and
     so later as XLA compiles the loop by default; with little optimisation it rounds some sums otherwise."""
     on, off = (run(slots)[1] for slots in (SLOTS, 0))
     for k, (one, other) in enumerate(zip(on, off, strict=True)):

@@ -33,7 +33,7 @@ def test_ring_with_wrap_around():
 
 
 def test_position_far_on():
-    """The position is right after a billion collects, near the end of int32 (count * n overflows there)."""
+    """The position is right after a billion rollouts, near the end of int32 (count * n overflows there)."""
     count = 2**31 - 1
     rows = replay.write(replay.allocate(1, CAPACITY, 1), jnp.ones((1, N, 1)), jnp.int32(count))
     start = count * N % CAPACITY

@@ -16,7 +16,7 @@ from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.envs import make
 from matd3_jax.training import checkpoint
-from matd3_jax.training.loop import Trainer
+from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.schedule import Schedule
 
 SEEDS, CAPACITY = 3, 48
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("quick_jit")
 def trainer(n_step=1, normalise=True):
     layout = JointLayout.of(ENV, {"agents": ALGORITHM}, n_step)
     hyper = {"agents": HYPER._replace(exploration_noise=0.0)}
-    return Trainer(ENV, layout, SCHEDULE, hyper, SEEDS, normalise_observations=normalise)
+    return TrainLoop(ENV, layout, SCHEDULE, hyper, SEEDS, normalise_observations=normalise)
 
 
 def in_numpy(state):
@@ -39,17 +39,17 @@ def in_numpy(state):
 
 @functools.cache
 def run():
-    """(trainer, its states after the prefill and after each of six collects, rows [seeds, n, row] of all play)."""
+    """(trainer, its states after the warm-up and after each of six rollouts, rows [seeds, n, row] of all play)."""
     t = trainer()
-    state, _ = t.prefill(t.init(jax.vmap(jax.random.key)(jnp.arange(SEEDS))))
+    state, _ = t.warm_up(t.init(jax.vmap(jax.random.key)(jnp.arange(SEEDS))))
     states = [in_numpy(state)]
-    rows = [states[0].replay[:SEEDS, : 2 * SCHEDULE.collect_steps]]
-    chunk = t.chunk(1)
+    rows = [states[0].replay[:SEEDS, : 2 * SCHEDULE.rollout_steps]]
+    interval = t.interval(1)
     for _ in range(6):
-        at = int(state.collects) * SCHEDULE.collect_steps % CAPACITY
-        state, _ = chunk(state)
+        at = int(state.rollouts) * SCHEDULE.rollout_steps % CAPACITY
+        state, _ = interval(state)
         states.append(in_numpy(state))
-        rows.append(states[-1].replay[:SEEDS, at : at + SCHEDULE.collect_steps])
+        rows.append(states[-1].replay[:SEEDS, at : at + SCHEDULE.rollout_steps])
     return t, state, states, rows
 
 
@@ -67,12 +67,12 @@ def of_seed(statistics, seed):
 
 
 def test_statistics_of_everything_collected():
-    """After the prefill and after each collect, also when the ring has dropped the first rows: mean and variance of
+    """After the warm-up and after each rollout, also when the ring has dropped the first rows: mean and variance of
     each entry over all observations acted on, for each seed its own."""
     _, _, states, rows = run()
     for k, state in enumerate(states):
         x = np.concatenate(rows[: k + 1], axis=1)[..., :12].astype(np.float64)
-        assert x.shape[1] == (2 + k) * SCHEDULE.collect_steps
+        assert x.shape[1] == (2 + k) * SCHEDULE.rollout_steps
         # float32: a handful of means of means; entries are of order 1.
         np.testing.assert_allclose(state.statistics.mean[:SEEDS], x.mean(axis=1), atol=1e-6)
         np.testing.assert_allclose(state.statistics.variance[:SEEDS], x.var(axis=1), rtol=1e-5, atol=1e-8)
@@ -81,17 +81,17 @@ def test_statistics_of_everything_collected():
 
 
 def test_float32_lasts():
-    """20,000 collects of entries far from zero, drifting, nearly constant and constant."""
+    """20,000 rollouts of entries far from zero, drifting, nearly constant and constant."""
     rng = np.random.default_rng(0)
-    collects, n = 20_000, 10
-    drift = np.linspace(0, 5, collects)[:, None, None]
-    x = rng.normal(size=(collects, n, 4)) * [1, 1, 1e-3, 0] + [1000, 0, 1, 0.1] + drift * [0, 1, 0, 0]
+    rollouts, n = 20_000, 10
+    drift = np.linspace(0, 5, rollouts)[:, None, None]
+    x = rng.normal(size=(rollouts, n, 4)) * [1, 1, 1e-3, 0] + [1000, 0, 1, 0.1] + drift * [0, 1, 0, 0]
     x = x.astype(np.float32)
 
     def step(statistics, inputs):
         return running_statistics.merge(statistics, *inputs), None
 
-    got, _ = jax.jit(lambda x: jax.lax.scan(step, running_statistics.initial(4), (x, jnp.arange(collects))))(x)
+    got, _ = jax.jit(lambda x: jax.lax.scan(step, running_statistics.initial(4), (x, jnp.arange(rollouts))))(x)
     flat = x.reshape(-1, 4).astype(np.float64)
     # In standard deviations (1e-4 for the constant one), where float32 itself resolves 1000 to 6e-5.
     error = np.abs(got.mean - flat.mean(axis=0)) / np.maximum(flat.std(axis=0), 1e-4)
@@ -146,7 +146,7 @@ def actions(groups, seed, x):
 @pytest.mark.parametrize("collect", [1, 5])
 def test_collecting_reads_normalised_observations(collect):
     """Without noise the stored actions are those of the actors, as they were, on the stored observations in units of
-    the statistics of all collects before; the replay keeps observations raw (they are what the environment gives)."""
+    the statistics of all rollouts before; the replay keeps observations raw (they are what the environment gives)."""
     _, _, states, rows = run()
     before = states[collect - 1]
     for seed in range(SEEDS):

@@ -1,4 +1,4 @@
-"""Teams of different runs against each other: episodes against NumPy policies and against `Training.evaluate`."""
+"""Teams of different runs against each other: episodes against NumPy policies and `TrainingSession.evaluate`."""
 
 import dataclasses
 

@@ -170,7 +170,7 @@ def test_training_from_the_command(tmp_path, quick_jit):
     assert table.values("seed") == [0, 1] and table.values("algo") == ["maddpg"]
     metrics = RunDirectory(tmp_path / "runs" / "runs" / "simple_spread-maddpg").read_metrics()
     episodes = table.by_seed("episodes").sum(axis=1)
-    assert episodes.tolist() == [44, 44]  # of 25 steps; whole chunks: 1,100 env steps
+    assert episodes.tolist() == [44, 44]  # of 25 steps; whole intervals: 1,100 env steps
     # The last fifth: eight episodes, the last row (200 env steps) alone.
     last = metrics["return_agents"][metrics["step"] == metrics["step"].max()]
     np.testing.assert_allclose(tidy.final(table, "return_agents"), last, rtol=1e-4)

@@ -10,7 +10,7 @@ import numpy as np
 from matd3_jax import config, envs
 from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.evaluation import cross_play
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 STEPS, SEED = 5, 11
 SMALL = [
@@ -27,7 +27,7 @@ RUNS = {
 
 
 class Run(NamedTuple):
-    training: Training
+    training: TrainingSession
     state: object
 
     def team(self, name):
@@ -37,7 +37,7 @@ class Run(NamedTuple):
 
 def make(settings, env=None, number=0):
     """A run whose policies (biases too) and statistics are random: of which training they come does not matter."""
-    training, rng = Training(config.load(settings), env), np.random.default_rng(number)
+    training, rng = TrainingSession(config.load(settings), env), np.random.default_rng(number)
     trainer = training.trainer
     shapes = trainer.abstract_state()
     groups = jax.tree.map(lambda leaf: rng.normal(0, 0.5, leaf.shape).astype(leaf.dtype), shapes.groups)
@@ -52,7 +52,7 @@ def make(settings, env=None, number=0):
             env=jax.tree.map(lambda shape: np.zeros(shape.shape, shape.dtype), shapes.env),
             replay=jnp.zeros((trainer.rows, trainer.schedule.replay_capacity, training.layout.row_size)),
             key=trainer.fill(training.keys()),
-            collects=jnp.int32(2),
+            rollouts=jnp.int32(2),
             statistics=statistics,
         ),
     )

@@ -27,7 +27,7 @@ from matd3_jax.runtime import multihost, slurm
 from matd3_jax.runtime.multihost import Processes
 from matd3_jax.sweep import runner
 from matd3_jax.training import checkpoint
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 # A point mass, with evaluations and a ring that comes round on the way.
 TINY = [
@@ -242,14 +242,14 @@ options, stop, *arguments = sys.argv[1:]
 if options:
     jax.jit = functools.partial(jax.jit, compiler_options=json.loads(options))
 from matd3_jax.cli import command, train
-from matd3_jax.training.session import Training
-advance = Training.advance
+from matd3_jax.training.session import TrainingSession
+advance = TrainingSession.advance
 def counted(self, state):
     state, row = advance(self, state)
     if str(row["step"][0]) == stop:
         os.kill(os.getpid(), signal.SIGTERM)
     return state, row
-Training.advance = counted
+TrainingSession.advance = counted
 sys.exit(command.code(train.main, arguments))
 """
 
@@ -335,7 +335,7 @@ def leaves(run: Path) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("index", range(3))
 def test_any_number_of_processes_reads_a_checkpoint_of_one(alone, index):
     run, settings = RunDirectory.open(alone)
-    training = Training(settings, processes=Processes(index, 3))
+    training = TrainingSession(settings, processes=Processes(index, 3))
     state = checkpoint.restore(checkpoint.verify(run.checkpoints), training.trainer, training.share)
     own, saved = [slice(0, 3), slice(3, 5), slice(5, 7)][index], leaves(alone)
     for path, leaf in jax.tree_util.tree_flatten_with_path(state.groups)[0]:
@@ -391,6 +391,6 @@ def test_a_sweep_shares_the_seeds_of_each_piece(tmp_path, monkeypatch):
         same_numbers(table(several), table(one))
         assert json.loads((several / "summary.json").read_text())["last_tenth"].keys() == {"agents"}
         saved = [checkpoint.verify(run / "checkpoints") for run in (several, one)]
-        states = [checkpoint.restore_actors(path, Training(setting).trainer) for path in saved]
+        states = [checkpoint.restore_actors(path, TrainingSession(setting).trainer) for path in saved]
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), *(s.groups for s in states))
     assert not (tmp_path / "2" / "pieces" / "0").exists()

@@ -12,7 +12,7 @@ from matd3_jax import config
 from matd3_jax.errors import UserError
 from matd3_jax.sweep import batching
 from matd3_jax.training import memory
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 BASE = ["env=simple_push", "seeds=2", "algo.hidden=[8]", "batch_size=16", "num_envs=2", "learning_starts=200",
         "replay_capacity=500", "total_steps=1500"]  # fmt: skip
@@ -43,12 +43,12 @@ def test_shapes_and_schedules_do_not(override):
 
 
 def test_settings_that_share_a_program_compile_to_the_same_text():
-    """What `program` says is what XLA sees: the lowered chunk does not depend on the members' numbers."""
+    """What `program` says is what XLA sees: the lowered interval does not depend on the members' numbers."""
 
     def lowered(*more: str) -> str:
-        training = Training(load(*more))
+        training = TrainingSession(load(*more))
         state = jax.eval_shape(training.trainer.init, jax.eval_shape(training.keys))
-        return training.chunk.jitted.lower(state, training.trainer.hyper).as_text()
+        return training.interval.jitted.lower(state, training.trainer.hyper).as_text()
 
     assert lowered("algo.lr=0.3", "algo.tau=0.5", "algo.gamma=0.1") == lowered()
     assert lowered("algo.target_noise=0.2") != lowered()
@@ -107,13 +107,13 @@ def test_packing_takes_no_more_pieces_than_needed():
     ],
 )
 def test_the_computed_memory_covers_the_compiled_program(quickly_compiled, monkeypatch, more):
-    """Arguments and temporaries that XLA reserves for the chunk lie below what is computed beforehand, and the replay
-    is most of both where it is large."""
-    training = Training(load("replay_capacity=20000", "total_steps=20000", *more))
+    """Arguments and temporaries that XLA reserves for the interval lie below what is computed beforehand, and the
+    replay is most of both where it is large."""
+    training = TrainingSession(load("replay_capacity=20000", "total_steps=20000", *more))
     trainer, seeds = training.trainer, len(training.seeds)
     state = jax.eval_shape(trainer.init, jax.eval_shape(training.keys))
     monkeypatch.setattr(jax, "jit", quickly_compiled)
-    analysis = training.chunk.jitted.lower(state, trainer.hyper).compile().memory_analysis()
+    analysis = training.interval.jitted.lower(state, trainer.hyper).compile().memory_analysis()
     used = trainer.mesh.size * (analysis.argument_size_in_bytes + analysis.temp_size_in_bytes)
     computed = memory.needed(trainer, seeds) - memory.PROCESS
     assert trainer.replay_bytes < used <= computed
@@ -121,7 +121,7 @@ def test_the_computed_memory_covers_the_compiled_program(quickly_compiled, monke
 
 
 def test_the_most_seeds_are_those_that_just_fit():
-    trainer = Training(load("replay_capacity=100000", "total_steps=100000")).trainer
+    trainer = TrainingSession(load("replay_capacity=100000", "total_steps=100000")).trainer
     for budget in (memory.needed(trainer, 1), memory.needed(trainer, 5) + 1, memory.PROCESS + 10**9):
         seeds = memory.most_seeds(trainer, budget)
         assert memory.needed(trainer, seeds) <= budget

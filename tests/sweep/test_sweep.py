@@ -17,7 +17,7 @@ from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.sweep import launcher, ranking, runner
 from matd3_jax.sweep.runner import Piece, Sweep
 from matd3_jax.training import checkpoint
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 # Small enough to run in a second or two; both teams, an evaluation and the delay are there.
 TINY = [
@@ -141,8 +141,8 @@ def test_a_sweep_that_diverged_everywhere_is_reported(swept, tmp_path):
 
 
 def test_stopped_and_gone_on_with_it_is_the_same_sweep(swept, tmp_path, monkeypatch, capsys):
-    """A signal after the third chunk; what is left is gone on with, to the same numbers."""
-    advance, calls = Training.advance, []
+    """A signal after the third interval; what is left is gone on with, to the same numbers."""
+    advance, calls = TrainingSession.advance, []
 
     def counted(self, state):
         calls.append(1)
@@ -150,7 +150,7 @@ def test_stopped_and_gone_on_with_it_is_the_same_sweep(swept, tmp_path, monkeypa
             signal.raise_signal(signal.SIGTERM)
         return advance(self, state)
 
-    monkeypatch.setattr(Training, "advance", counted)
+    monkeypatch.setattr(TrainingSession, "advance", counted)
     assert sweep.main([*TINY, *SWEPT, "seeds=2", f"out={tmp_path}", "name=cut"]) == 128 + signal.SIGTERM
     assert f"resume={tmp_path / 'cut'}" in capsys.readouterr().out
     assert not (tmp_path / "cut" / "table.csv").exists()

@@ -1,4 +1,4 @@
-"""What the compiler makes of a chunk: one program, and no copy of the replay in its loop."""
+"""What the compiler makes of an interval: one program, and no copy of the replay in its loop."""
 
 import math
 import re
@@ -11,7 +11,7 @@ from ledger import HYPER
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.envs import make
-from matd3_jax.training.loop import Trainer
+from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.schedule import Schedule
 
 CAPACITY = 6 * 1361  # a number that nothing else in the program has
@@ -29,7 +29,7 @@ def trainer(request):
     seeds, n_step = request.param
     layout = JointLayout.of(env, {"agents": Algorithm(hidden=(4,), smoothing=True)}, n_step)
     schedule = Schedule(num_envs=2, rollout_length=3, batch_size=8, replay_capacity=CAPACITY, learning_starts=1)
-    return Trainer(env, layout, schedule, {"agents": HYPER}, seeds, devices=jax.devices()[:1])
+    return TrainLoop(env, layout, schedule, {"agents": HYPER}, seeds, devices=jax.devices()[:1])
 
 
 def start(trainer):
@@ -38,8 +38,8 @@ def start(trainer):
 
 @pytest.fixture(scope="module")
 def compiled(trainer):
-    """The chunk as XLA compiles it; machine code is not looked at and may be as slow as it likes."""
-    program = trainer.chunk(2)
+    """The interval as XLA compiles it; machine code is not looked at and may be as slow as it likes."""
+    program = trainer.interval(2)
     options = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
     return program.jitted.lower(start(trainer), program.hyper).compile(compiler_options=options)
 
@@ -70,7 +70,8 @@ def in_loops(found):
 
 def test_replay_is_never_copied_in_the_loop(compiled):
     """Nothing in the loop gives out an array of the replay's size but writes in place: no copy, select, scatter (what
-    `cond` and `vmap` make of a conditional or a batched write), nor a fusion around one. 200 MB a cycle otherwise."""
+    `cond` and `vmap` make of a conditional or a batched write), nor a fusion around one. 200 MB an iteration
+    otherwise."""
     found = computations(compiled.as_text())
     loops = in_loops(found)
     assert loops
@@ -95,7 +96,7 @@ def test_memory(trainer, compiled):
 
 
 def test_one_compilation_and_donation(trainer):
-    """A chunk is compiled with its first call and never again, though states come from `init`, `prefill` and from
+    """An interval is compiled with its first call and never again, though states come from `init`, `warm-up` and from
     itself; each state given in is gone after it, in every leaf."""
     if trainer.num_seeds == 1 or trainer.layout.n_step > 1:
         pytest.skip("the same for any number of seeds or steps")
@@ -103,17 +104,17 @@ def test_one_compilation_and_donation(trainer):
     jax.monitoring.register_event_duration_secs_listener(
         lambda event, seconds, **_: compiles.append(event) if "backend_compile" in event else None
     )
-    chunk = trainer.chunk(2)
+    interval = trainer.interval(2)
     states = [start(trainer)]
     for repetition in range(3):
         before = len(compiles)
-        state, metrics = chunk(states[-1])
+        state, metrics = interval(states[-1])
         jax.block_until_ready(metrics)
         assert (len(compiles) - before > 0) == (repetition == 0)
         assert all(leaf.is_deleted() for leaf in jax.tree.leaves(states[-1]) if math.prod(leaf.shape) > 1)
         states.append(state)
     before = len(compiles)
-    prefilled, _ = trainer.prefill(start(trainer))
+    prefilled, _ = trainer.warm_up(start(trainer))
     used = len(compiles)
-    chunk(prefilled)
+    interval(prefilled)
     assert len(compiles) == used > before

@@ -9,7 +9,7 @@ import pytest
 from benchmarks import limits
 from matd3_jax import config
 from matd3_jax.training import cost
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 SMALL = ("total_steps=2000", "replay_capacity=200", "learning_starts=100", "batch_size=16", "seeds=2")
 ANT = ("env=ant", "num_envs=1", "rollout_length=1", "updates_per_collect=1", "algo.hidden=[400,300]")
@@ -17,7 +17,7 @@ WIDE = ("num_envs=20", "rollout_length=1", "updates_per_collect=2", "algo.hidden
 
 
 def training(*settings, **options):
-    return Training(config.load([*SMALL, *settings]), **options)
+    return TrainingSession(config.load([*SMALL, *settings]), **options)
 
 
 @pytest.mark.parametrize(
@@ -35,12 +35,12 @@ def training(*settings, **options):
     ids=" ".join,
 )
 def test_products_are_those_of_the_limits(settings):
-    """Counted for one env step of one seed; there, product by product for a whole cycle of a device."""
+    """Counted for one env step of one seed; there, product by product for a whole iteration of a device."""
     found = training(*settings)
     trainer, layout, schedule = found.trainer, found.layout, found.trainer.schedule
     by_part = {
         part: sum(n * product.flops for product, n in limits.products(trainer, part).items())
-        / (trainer.local_seeds * trainer.cycle_steps)
+        / (trainer.local_seeds * trainer.iteration_steps)
         for part in ("rollout", "loop")
     }
     assert trainer.devices_per_seed == 1
@@ -81,10 +81,10 @@ def test_the_expectation_by_hand(monkeypatch):
     settings = (*ANT, "total_steps=20000", "learning_starts=10000", "replay_capacity=20000")
     found = training(*settings, "eval_every=1000", "eval_episodes=3")
     layout, schedule, total = found.layout, found.trainer.schedule, found.total_steps
-    prefill = found.trainer.prefill_steps
-    assert prefill < 10000 and 20000 <= total < 21000
-    played = total + 12 * 3 * 1000  # evaluations after the prefill and at 10,000, 11,000 ... 20,000
-    flops = played * cost.acting_flops(layout) + (total - prefill) * cost.update_flops(layout, schedule)
+    warm_up = found.trainer.warmup_steps
+    assert warm_up < 10000 and 20000 <= total < 21000
+    played = total + 12 * 3 * 1000  # evaluations after the warm-up and at 10,000, 11,000 ... 20,000
+    flops = played * cost.acting_flops(layout) + (total - warm_up) * cost.update_flops(layout, schedule)
     seconds = 2 * flops / (0.6 * 2e9) + played / 5678  # each of two devices steps one seed
     assert cost.expectation(found) == (
         f"expected: about {seconds / 60:.0f} minutes, compiling apart "
@@ -92,7 +92,7 @@ def test_the_expectation_by_hand(monkeypatch):
     )
     assert 2 < seconds / 60 < 60
     # Of a run that goes on, what is left.
-    rest = cost.expectation(found, done=prefill + (total - prefill) // 2)
+    rest = cost.expectation(found, done=warm_up + (total - warm_up) // 2)
     minutes = int(re.search(r"about (\d+) minutes", rest)[1])
     assert minutes < seconds / 60 / 1.5
 

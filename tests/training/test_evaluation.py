@@ -157,7 +157,7 @@ def test_compiled_once():
 
 
 def test_training_does_not_depend_on_evaluation(monkeypatch):
-    """Without evaluations (none is compiled then) and with one after every chunk: the same table and state, bit for
+    """Without evaluations (none is compiled then) and with one after every interval: the same table and state, bit for
     bit."""
     often = train(eval_every=1)
     assert not np.isnan(often.metrics["eval_return_agents"]).any()
@@ -177,7 +177,7 @@ def test_training_does_not_depend_on_evaluation(monkeypatch):
 def test_evaluation_interval(every, total, steps):
     settings = {**SMALL, "eval_every": every, "total_steps": total}
     config = matd3_jax.config.load([f"{k}={'null' if v is None else v}" for k, v in settings.items()])
-    assert session.Training(config, Ledger()).eval_every == steps
+    assert session.TrainingSession(config, Ledger()).eval_every == steps
 
 
 def test_stops_when_all_episodes_have_ended():

@@ -1,4 +1,5 @@
-"""The loop: what is stored, when updates come and what they move, and that seeds, devices and chunks do not matter."""
+"""The loop: what is stored, when updates come and what they move, and that seeds, devices and intervals do not
+matter."""
 
 import dataclasses
 import functools
@@ -13,7 +14,7 @@ from ledger import ENDS, HYPER, LIMIT, Ledger, by_hand
 from matd3_jax.core import rollout, update
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
-from matd3_jax.training.loop import Trainer
+from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.schedule import Schedule
 
 MATD3 = Algorithm(hidden=(4,))
@@ -34,11 +35,11 @@ def make(seeds, schedule=SCHEDULE, delays=(2, 1), env=None, tau=0.1, **options):
     # A learning rate for each seed: seeds must not mix up their hyper-parameters.
     rates = np.array([0.01, 0.02, 0.03])[seeds]
     hyper = {team: HYPER._replace(critic_lr=rates, tau=tau) for team in env.teams}
-    return Trainer(env, JointLayout.of(env, algorithms), schedule, hyper, len(seeds), **options)
+    return TrainLoop(env, JointLayout.of(env, algorithms), schedule, hyper, len(seeds), **options)
 
 
 def start(trainer, seeds):
-    return trainer.prefill(trainer.init(jax.vmap(jax.random.key)(jnp.asarray(seeds))))
+    return trainer.warm_up(trainer.init(jax.vmap(jax.random.key)(jnp.asarray(seeds))))
 
 
 def plain(tree):
@@ -52,19 +53,20 @@ def plain(tree):
 
 def back(state, seeds):
     """Some seeds of what `plain` made of a state, ready to be trained on."""
-    key, collects = jax.random.wrap_key_data(state.key[seeds]), jnp.int32(state.collects)
-    some = jax.tree.map(lambda leaf: jnp.asarray(leaf[seeds]), state._replace(key=(), collects=()))
-    return some._replace(key=key, collects=collects)
+    key, rollouts = jax.random.wrap_key_data(state.key[seeds]), jnp.int32(state.rollouts)
+    some = jax.tree.map(lambda leaf: jnp.asarray(leaf[seeds]), state._replace(key=(), rollouts=()))
+    return some._replace(key=key, rollouts=rollouts)
 
 
 @functools.cache
 def main_run():
-    """Three seeds on all devices, tau = 1: states after the prefill and after one, two and three cycles, metrics."""
+    """Three seeds on all devices, tau = 1: states after the warm-up and after one, two and three iterations,
+    metrics."""
     trainer = make([0, 1, 2], tau=1.0)
     state, episodes = start(trainer, [0, 1, 2])
-    states, metrics, chunk = [plain(state)], [], trainer.chunk(1)
+    states, metrics, interval = [plain(state)], [], trainer.interval(1)
     for _ in range(3):
-        state, m = chunk(state)
+        state, m = interval(state)
         states.append(plain(state))
         metrics.append(plain(m))
     return trainer, states, plain(episodes), metrics
@@ -74,16 +76,16 @@ def main_run():
 
 
 def transitions(seed):
-    """Rows of a seed in the order of play, [collects * rollout_length, num_envs, row] of all that were collected."""
+    """Rows of a seed in the order of play, [rollouts * rollout_length, num_envs, row] of all that were collected."""
     _, states, _, _ = main_run()
-    collects = []
+    rollouts = []
     for before, after in itertools.pairwise(states):
-        for c in range(int(before.collects), int(after.collects)):
-            at = c * SCHEDULE.collect_steps % SCHEDULE.replay_capacity
-            collects.append(after.replay[seed, at : at + SCHEDULE.collect_steps])
+        for c in range(int(before.rollouts), int(after.rollouts)):
+            at = c * SCHEDULE.rollout_steps % SCHEDULE.replay_capacity
+            rollouts.append(after.replay[seed, at : at + SCHEDULE.rollout_steps])
     first = states[0]
-    rows = first.replay[seed, : int(first.collects) * SCHEDULE.collect_steps]
-    return np.concatenate([rows, *collects]).reshape(-1, SCHEDULE.num_envs, rows.shape[-1])
+    rows = first.replay[seed, : int(first.rollouts) * SCHEDULE.rollout_steps]
+    return np.concatenate([rows, *rollouts]).reshape(-1, SCHEDULE.num_envs, rows.shape[-1])
 
 
 @pytest.mark.parametrize("seed", range(SEEDS))
@@ -91,7 +93,7 @@ def test_transitions_are_exact(seed):
     """Each stored transition is what the environment does with the stored action: reward, the TRUE final observation
     as x' at an episode's end, discount 0 only where it terminated. Play goes on from x', or from a fresh episode."""
     rows = transitions(seed)
-    assert rows.shape == (8 * 4, 3, 7 + 4 + 2 + 7 + 1)  # two collects of prefill, three cycles of two each
+    assert rows.shape == (8 * 4, 3, 7 + 4 + 2 + 7 + 1)  # two rollouts of warm-up, three iterations of two each
     ends = {"terminated": 0, "truncated": 0}
     numbers = set()
     for e in range(SCHEDULE.num_envs):
@@ -118,7 +120,7 @@ def test_transitions_are_exact(seed):
 
 def test_episode_sums():
     """Count, length and undiscounted return of the episodes that ended, from the stored rewards by hand."""
-    _, states, prefill, metrics = main_run()
+    _, states, warm_up, metrics = main_run()
     for seed in range(SEEDS):
         count, length, returns = 0, 0, np.zeros(2)
         for e in range(SCHEDULE.num_envs):
@@ -128,7 +130,7 @@ def test_episode_sums():
                 if row[14] == LIMIT or row[14] == ENDS and row[13] < 0.5:
                     count, length, returns = count + 1, length + row[14], returns + running
                     running = np.zeros(2)
-        parts = [prefill, *(m.episodes for m in metrics)]
+        parts = [warm_up, *(m.episodes for m in metrics)]
         total = jax.tree.map(lambda *e, s=seed: sum(x[s].sum(axis=0) for x in e), *parts)
         assert (total.count, total.length) == (count, length)
         np.testing.assert_allclose(total.episode_return, returns, rtol=1e-5)  # float32 sums of a hundred rewards
@@ -138,19 +140,19 @@ def test_episode_sums():
 
 
 def test_counts_of_the_real_learner():
-    """No update before `learning_starts` transitions, then one for each collect; MATD3 (d = 2) moves actor and targets
+    """No update before `learning_starts` transitions, then one for each rollout; MATD3 (d = 2) moves actor and targets
     with every second, MADDPG with each; with tau = 1 the targets equal the online networks right after they moved, as
-    the last update of a cycle must move them."""
+    the last update of an iteration must move them."""
     trainer, states, _, metrics = main_run()
-    assert trainer.schedule.prefill_collects == 2 and trainer.cycle_collects == 2
-    for cycles, state in enumerate(states):
-        assert state.collects == 2 + 2 * cycles
-        assert trainer.updates(int(state.collects)) == 2 * cycles
+    assert trainer.schedule.warmup_rollouts == 2 and trainer.rollouts_per_iteration == 2
+    for iterations, state in enumerate(states):
+        assert state.rollouts == 2 + 2 * iterations
+        assert trainer.updates(int(state.rollouts)) == 2 * iterations
         written = (state.replay != 0).any(axis=-1).sum(axis=1)
-        assert (written == min(24 + 24 * cycles, 60)).all()
+        assert (written == min(24 + 24 * iterations, 60)).all()
         for group, delay in zip(state.groups, (2, 1), strict=True):
-            assert (group.critic_optimiser.count == 2 * cycles).all()
-            assert (group.actor_optimiser.count == 2 * cycles // delay).all()
+            assert (group.critic_optimiser.count == 2 * iterations).all()
+            assert (group.actor_optimiser.count == 2 * iterations // delay).all()
             for online, target in ((group.actor, group.actor_target), (group.critic, group.critic_target)):
                 # float32: 1 * online + 0 * target, perhaps written target + 1 * (online - target).
                 jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-7), online, target)
@@ -183,19 +185,19 @@ def stub(log):
     return replaced
 
 
-def stubbed_run(monkeypatch, trainer, state, cycles):
-    """(moves of each group so far as a string of bits, metrics of each cycle, shapes of the rows)."""
+def stubbed_run(monkeypatch, trainer, state, iterations):
+    """(moves of each group so far as a string of bits, metrics of each iteration, shapes of the rows)."""
     log = []
     monkeypatch.setattr(update, "update", stub(log))
     ones = jax.tree.map(lambda leaf: jnp.ones_like(leaf), [g.actor for g in state.groups])
     state = state._replace(groups=tuple(g._replace(actor=a) for g, a in zip(state.groups, ones, strict=True)))
-    state, metrics = trainer.chunk(cycles)(state)
+    state, metrics = trainer.interval(iterations)(state)
     numbers = [np.unique(np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(g.actor)])) for g in state.groups]
     return [f"{int(n.item()):b}"[1:] for n in numbers], plain(metrics), log
 
 
 def moves(monkeypatch, delays, updates):
-    """(bits of two cycles, expected bits): nothing is played, only the schedule counts."""
+    """(bits of two iterations, expected bits): nothing is played, only the schedule counts."""
 
     def stay(env, layout, policy, env_state, key, length, **options):
         rows = jnp.zeros((length * env_state.episode_step.shape[0], layout.row_size))
@@ -203,8 +205,8 @@ def moves(monkeypatch, delays, updates):
 
     monkeypatch.setattr(rollout, "collect", stay)
     trainer = make([0], dataclasses.replace(SCHEDULE, updates_per_collect=updates), delays)
-    bits, _, _ = stubbed_run(monkeypatch, trainer, back(main_run()[1][0], slice(0, 1)), cycles=2)
-    total = 2 * trainer.cycle_collects * updates
+    bits, _, _ = stubbed_run(monkeypatch, trainer, back(main_run()[1][0], slice(0, 1)), iterations=2)
+    total = 2 * trainer.rollouts_per_iteration * updates
     assert total % np.lcm(*delays) == 0
     return bits, ["".join("1" if u % d == 0 else "0" for u in range(1, total + 1)) for d in delays]
 
@@ -215,7 +217,7 @@ def moves(monkeypatch, delays, updates):
 )
 def test_moves(monkeypatch, delays, updates):
     """Actors and targets move with exactly every d-th update of the learner (the d-th first), counted in updates and
-    not in env steps, for teams of different delays and one or many updates a collect."""
+    not in env steps, for teams of different delays and one or many updates a rollout."""
     got, want = moves(monkeypatch, delays, updates)
     assert got == want
 
@@ -237,7 +239,7 @@ def test_minibatches(monkeypatch, shared):
     updates see all that the ring holds; nobody draws an empty row. 4,000 draws miss one of 60 rows once in 10^27."""
     schedule = dataclasses.replace(SCHEDULE, batch_size=4000, shared_minibatch=shared)
     trainer = make([0], schedule, delays=(1, 1), devices_per_seed=1)
-    _, metrics, log = stubbed_run(monkeypatch, trainer, back(main_run()[1][0], slice(0, 1)), cycles=4)
+    _, metrics, log = stubbed_run(monkeypatch, trainer, back(main_run()[1][0], slice(0, 1)), iterations=4)
     assert {shape[:2] for shape in log} == {(1 if shared else 2, 4000)}
     np.testing.assert_array_equal(metrics.update.critic_loss[0, :, 0], [36, 48, 60, 60])
     assert not metrics.update.q_value.any()
@@ -248,25 +250,25 @@ def test_minibatches(monkeypatch, shared):
 
 
 def same(one, other, seeds_one, seeds_other):
-    """Assert that the seeds of two states are alike in everything but `collects`.
+    """Assert that the seeds of two states are alike in everything but `rollouts`.
 
     Tolerance: float32; the same sums in another order or width of vectors, over six updates.
     """
-    leaves = [jax.tree.leaves(state._replace(collects=())) for state in (one, other)]
+    leaves = [jax.tree.leaves(state._replace(rollouts=())) for state in (one, other)]
     for a, b in zip(*leaves, strict=True):
         a, b = a[seeds_one], b[seeds_other]
         if np.issubdtype(a.dtype, np.floating):
             np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
         else:
             np.testing.assert_array_equal(a, b)
-    assert one.collects == other.collects
+    assert one.rollouts == other.rollouts
 
 
 def test_seed_alone():
     """Seed 1 with its own hyper-parameters by itself gives what it gives among three."""
     trainer = make([1], tau=1.0)
     state, _ = start(trainer, [1])
-    state, _ = trainer.chunk(3)(state)
+    state, _ = trainer.interval(3)(state)
     same(plain(state), main_run()[1][3], [0], [1])
     first, second = (jax.tree.leaves(main_run()[1][3].groups[0].critic)[-1][i] for i in (0, 1))
     assert np.abs(first - second).max() > 1e-3, "the seeds themselves differ"
@@ -274,12 +276,12 @@ def test_seed_alone():
 
 @pytest.mark.skipif(len(jax.devices()) < 2, reason="one device")
 def test_devices_and_pieces_and_chunks_and_unrolling():
-    """An odd number of seeds on one device, updated together, in one long chunk whose loops hold several cycles and
-    steps in an iteration: as on two devices, in three chunks."""
+    """An odd number of seeds on one device, updated together, in one long interval whose loops hold several iterations
+    and steps in an iteration: as on two devices, in three intervals."""
     several, states, _, metrics = main_run()
     assert several.mesh.size == 2 and several.rows == 4
     trainer = make([0, 1, 2], tau=1.0, devices=jax.devices()[:1], piece=3, unroll=2, unroll_steps=3)
-    state, long = trainer.chunk(3)(back(states[0], slice(0, 3)))
+    state, long = trainer.interval(3)(back(states[0], slice(0, 3)))
     same(plain(state), states[3], slice(0, 3), slice(0, 3))
     short = jax.tree.map(lambda *m: np.concatenate(m, axis=1)[:3], *metrics)
     # float32 as in `same`; returns are sums of some hundred.
@@ -297,7 +299,7 @@ def test_devices_that_share_a_seed():
     alone = make([1], trainer.schedule, tau=1.0, devices_per_seed=1)
     ends = []
     for t in (trainer, alone):
-        state, m = t.chunk(3)(t.prefill(t.init(jax.vmap(jax.random.key)(jnp.array([1]))))[0])
+        state, m = t.interval(3)(t.warm_up(t.init(jax.vmap(jax.random.key)(jnp.array([1]))))[0])
         ends.append((state, plain(state), plain(m)))
     same(ends[0][1], ends[1][1], slice(None), slice(None))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), ends[0][2], ends[1][2])

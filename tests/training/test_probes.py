@@ -17,7 +17,7 @@ from ledger import HYPER
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.envs import Box, Environment, Simplex, TimeStep
-from matd3_jax.training.loop import Trainer
+from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.schedule import Schedule
 
 GAMMA = 0.8
@@ -99,8 +99,8 @@ def trained(name):
     schedule = Schedule(
         num_envs=16, rollout_length=4, updates_per_collect=16, batch_size=64, replay_capacity=3200, learning_starts=64
     )
-    trainer = Trainer(ENV, layout, schedule, {"agents": HYPER}, 2)
-    state, metrics = trainer.chunk(70)(trainer.init(jax.vmap(jax.random.key)(jnp.arange(2))))
+    trainer = TrainLoop(ENV, layout, schedule, {"agents": HYPER}, 2)
+    state, metrics = trainer.interval(70)(trainer.init(jax.vmap(jax.random.key)(jnp.arange(2))))
     assert np.isfinite(metrics.update.critic_loss).all()
     return layout, jax.tree.map(np.asarray, state.groups), np.asarray(state.replay)
 

@@ -11,7 +11,7 @@ import pytest
 import matd3_jax
 from matd3_jax.training import clock, progress
 from matd3_jax.training.clock import Clock
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 NAN = np.full(2, np.nan)
 
@@ -131,13 +131,13 @@ def test_nested_reports_count_once(monkeypatch):
 def test_a_run_counts_its_evaluations(quickly_compiled, monkeypatch):
     """As many as have numbers in the table and as were expected; a slow one is no training."""
     monkeypatch.setattr(jax, "jit", quickly_compiled)
-    evaluate = Training.evaluate
+    evaluate = TrainingSession.evaluate
 
     def slow(self, *args, **options):
         time.sleep(0.2)
         return evaluate(self, *args, **options)
 
-    monkeypatch.setattr(Training, "evaluate", slow)
+    monkeypatch.setattr(TrainingSession, "evaluate", slow)
     left = []
     result = matd3_jax.train(
         "algo.hidden=[8]", env="simple", seeds=2, num_envs=2, batch_size=8, learning_starts=100, total_steps=1000,
@@ -146,8 +146,8 @@ def test_a_run_counts_its_evaluations(quickly_compiled, monkeypatch):
     training = result.training
     evaluated = np.isfinite(result.metrics["eval_return_agents"][0])
     assert evaluated.sum() == training.clock.evaluations >= 5
-    for chunk, step in enumerate(left):
-        assert training.evaluations_after(step) == evaluated[chunk + 1 :].sum()
+    for interval, step in enumerate(left):
+        assert training.evaluations_after(step) == evaluated[interval + 1 :].sum()
     assert training.clock.evaluation > 0.2 * training.clock.evaluations
     assert 0 < training.clock.training < 0.2 * training.clock.evaluations
 

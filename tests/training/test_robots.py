@@ -7,7 +7,7 @@ import pytest
 import matd3_jax
 from matd3_jax import config
 from matd3_jax.training import checkpoint
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 pytestmark = pytest.mark.usefixtures("quick_jit")
 
@@ -49,7 +49,7 @@ def test_the_ant_trains_and_is_evaluated(physics):
     ],
 )
 def test_agents_see_what_their_split_says(overrides, observations, actions):
-    training = Training(config.load(["env=ant", *overrides]))
+    training = TrainingSession(config.load(["env=ant", *overrides]))
     assert training.layout.observation_sizes == observations
     assert tuple(space.size for space in training.layout.action_spaces) == actions
     assert training.team_weights("agents").sum() == 1
@@ -74,12 +74,12 @@ def test_a_resumed_robot_goes_on_to_the_bit(env, seeds, tmp_path):
             rows.append(row)
         return state, rows
 
-    first = Training(settings)
+    first = TrainingSession(settings)
     state, _ = first.start()
     state, _ = first.advance(state)
     checkpoint.save(tmp_path, first.step(state), first.trainer, state, keep=1)
     whole, rows = go_on(first, state)
-    second = Training(settings)
+    second = TrainingSession(settings)
     resumed, others = go_on(second, checkpoint.restore(checkpoint.verify(tmp_path), second.trainer))
     for a, b in zip(jax.tree.leaves(whole._replace(key=())), jax.tree.leaves(resumed._replace(key=())), strict=True):
         np.testing.assert_array_equal(a, b)

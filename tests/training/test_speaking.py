@@ -35,7 +35,7 @@ def trained(name):
 def test_what_is_played_is_what_is_heard(name):
     """Every stored action is valid part by part, and the word in it stands in the listeners' next observation."""
     result, env = trained(name), RUNS[name][0]
-    layout, written = result.training.layout, 10 * int(result.state.collects)
+    layout, written = result.training.layout, 10 * int(result.state.rollouts)
     assert 60 <= written <= SMALL["replay_capacity"]
     parts = layout.row_parts(np.asarray(result.state.replay)[0, :written])
     for i, space in enumerate(layout.action_spaces):

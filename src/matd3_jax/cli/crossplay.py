@@ -25,7 +25,7 @@ from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runs.paths import paths
 from matd3_jax.runtime import devices
 from matd3_jax.training import checkpoint
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 HELP = """usage: python -m matd3_jax.crossplay runs=A,B,C [key=value ...]
 
@@ -111,7 +111,7 @@ def _entrants(where: Sequence[Path], step: int | None, matched: bool) -> tuple[l
         names = [str(path) for path in where]
     entrants = []
     for name, (run, settings), saved in zip(names, opened, found, strict=True):
-        training = Training(settings)
+        training = TrainingSession(settings)
         state = checkpoint.restore_actors(saved, training.trainer)
         teams = {team: cross_play.team_of(training, env, state, team) for team in TEAMS}
         entrants.append(Entrant(name, run.path, settings, int(saved.name), teams))

@@ -17,7 +17,7 @@ from matd3_jax.runtime import devices
 from matd3_jax.stats.intervals import mean_interval
 from matd3_jax.training import checkpoint
 from matd3_jax.training.loop import TrainState
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 HELP = """usage: python -m matd3_jax.evaluate run=RUN_DIR [episodes=100] [seed=0] [checkpoint=STEP]
 
@@ -36,7 +36,7 @@ def main(argv: Sequence[str]) -> int:
     devices.prepare()
     options = _options(argv)
     run, settings = RunDirectory.open(Path(options["run"]))
-    training = Training(settings)
+    training = TrainingSession(settings)
     path = checkpoint.verify(run.checkpoints, options["checkpoint"])
     state = checkpoint.restore_actors(path, training.trainer)
     table = Table(title=f"{run.path}, env step {int(path.name):,}: means of {options['episodes']} episodes a seed")
@@ -72,7 +72,7 @@ def _online(state: TrainState) -> TrainState:
     return state._replace(groups=tuple(group._replace(actor_average=None) for group in state.groups))
 
 
-def _quantities(training: Training, found: Evaluation) -> list[tuple[str, np.ndarray]]:
+def _quantities(training: TrainingSession, found: Evaluation) -> list[tuple[str, np.ndarray]]:
     """(name, values [seeds, episodes]): returns by team and agent, length, measures; names as in the metrics table."""
     layout, returns = training.layout, np.asarray(found.episode_return)
     teams = [(f"return_{team}", returns @ training.team_weights(team)) for team in dict.fromkeys(layout.teams)]

@@ -11,7 +11,7 @@ from matd3_jax.evaluation import trajectory
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import devices
 from matd3_jax.training import checkpoint
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 from matd3_jax.video import encode, frames
 
 HELP = """usage: python -m matd3_jax.render run=RUN_DIR [key=value ...]
@@ -93,9 +93,9 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def _training(settings: config.Config) -> Training:
+def _training(settings: config.Config) -> TrainingSession:
     try:
-        return Training(settings)
+        return TrainingSession(settings)
     except RuntimeError as error:
         if "MUJOCO_GL" in str(error):  # MuJoCo cannot even be imported with a value that it does not know
             raise UserError(" ".join(str(error).split())) from error

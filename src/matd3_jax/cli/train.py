@@ -19,7 +19,7 @@ from matd3_jax.runtime.signals import Stop
 from matd3_jax.training import checkpoint, cost
 from matd3_jax.training.loop import TrainState
 from matd3_jax.training.progress import ProgressBar
-from matd3_jax.training.session import Row, Training
+from matd3_jax.training.session import Row, TrainingSession
 
 HELP = """usage: python -m matd3_jax.train [env=NAME] [algo=NAME] [adversary=NAME] [recipe=NAME] [key=value ...]
        python -m matd3_jax.train resume=RUN_DIR [checkpoint=STEP] [total_steps=N]
@@ -66,7 +66,7 @@ def main(argv: Sequence[str]) -> int:
 
 def start(settings: Config, processes: Processes) -> int:
     """A fresh run."""
-    training = Training(settings, processes=processes)
+    training = TrainingSession(settings, processes=processes)
     training.check_memory()
     _tensorboard_writer(settings, None)
     path = Path(settings.out) / (settings.name or _name(settings))
@@ -91,7 +91,7 @@ def resume(path: Path, step: Any, overrides: Sequence[str], processes: Processes
         raise UserError(f"checkpoint={step!r}: must be the env step of a checkpoint")
     run, settings = RunDirectory.open(path)
     settings = config.from_dict({**settings.to_dict(), **changed})
-    training = Training(settings, processes=processes)
+    training = TrainingSession(settings, processes=processes)
     saved = Path(processes.tell(str(checkpoint.verify(run.checkpoints, step)) if processes.first else None))
     done = int(saved.name)
     if done >= training.total_steps:
@@ -107,13 +107,13 @@ def resume(path: Path, step: Any, overrides: Sequence[str], processes: Processes
     if processes.first:
         config.write(settings, run.path / "config.yaml")
         run.cut(done)
-    row = {"step": np.array([done]), "updates": np.array([training.trainer.updates(int(state.collects))])}
+    row = {"step": np.array([done]), "updates": np.array([training.trainer.updates(int(state.rollouts))])}
     return _advance(training, run, state, row, stop)
 
 
-def _advance(training: Training, run: RunDirectory, state: TrainState, row: Row, stop: Stop) -> int:
-    """Chunk after chunk to the end, or until a signal comes. Of several processes the first alone tells of the run, in
-    files and on the terminal."""
+def _advance(training: TrainingSession, run: RunDirectory, state: TrainState, row: Row, stop: Stop) -> int:
+    """Interval after interval to the end, or until a signal comes. Of several processes the first alone tells of the
+    run, in files and on the terminal."""
     settings, processes, begun = training.config, training.processes, time.monotonic()
     step = saved = int(row["step"][0])
     report = Report(training, run, row) if processes.first else None
@@ -166,7 +166,7 @@ def _advance(training: Training, run: RunDirectory, state: TrainState, row: Row,
     return 0
 
 
-def _announce(training: Training, run: RunDirectory, done: int = 0) -> None:
+def _announce(training: TrainingSession, run: RunDirectory, done: int = 0) -> None:
     """What is going to be trained, from env step `done` on."""
     settings, trainer = training.config, training.trainer
     kinds = ", ".join(dict.fromkeys(device.device_kind for device in trainer.mesh.devices.flat))
@@ -185,7 +185,7 @@ def _announce(training: Training, run: RunDirectory, done: int = 0) -> None:
         print(f"note: {note}", flush=True)
 
 
-def _robot_lines(training: Training) -> list[str]:
+def _robot_lines(training: TrainingSession) -> list[str]:
     """What is chosen for robots alone: the recipe of the settings, and the engine."""
     lines, recipe = [], getattr(training.config, "recipe", None)
     if recipe is not None and "forward_velocity" in training.env.measures:
@@ -201,7 +201,7 @@ def _robot_lines(training: Training) -> list[str]:
     return lines
 
 
-def _title(training: Training) -> str:
+def _title(training: TrainingSession) -> str:
     teams = dict.fromkeys(training.layout.teams)
     names = [f"{training.config.teams()[team].name}" for team in teams]
     return f"{training.config.env['name']}: " + " against ".join(dict.fromkeys(names))
@@ -215,12 +215,12 @@ def _name(settings: Config) -> str:
 class Report:
     """What a run tells while it goes: rows of the metrics table, progress, TensorBoard files where asked for."""
 
-    def __init__(self, training: Training, run: RunDirectory, row: Row):
+    def __init__(self, training: TrainingSession, run: RunDirectory, row: Row):
         self.run, self.progress = run, ProgressBar(training, row)
         self.writer = _tensorboard_writer(training.config, run)
 
     def add(self, row: Row) -> None:
-        """One more chunk."""
+        """One more interval."""
         self.run.append(row)
         self.progress.show(row)
         if self.writer is not None:

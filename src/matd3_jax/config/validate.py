@@ -63,7 +63,7 @@ def check(config: "Config") -> None:
     )
     need(
         config.replay_capacity % collect == 0,
-        f"replay_capacity={config.replay_capacity} is not a multiple of the {collect} transitions of one collect "
+        f"replay_capacity={config.replay_capacity} is not a multiple of the {collect} transitions of one rollout "
         f"(num_envs={config.num_envs} x rollout_length={config.rollout_length}); "
         f"nearest: {max(1, round(config.replay_capacity / collect)) * collect}",
     )

@@ -32,7 +32,7 @@ class Reservoir(NamedTuple):
 
     pairs: Pairs
     since: chex.Array
-    """int32 scalar: collects done at the last evaluation."""
+    """int32 scalar: rollouts done at the last evaluation."""
 
 
 class Values(NamedTuple):
@@ -51,7 +51,7 @@ def allocate(state: Any, size: int, layout: JointLayout) -> Pairs:
 
 
 def keep(pairs: Pairs, new: Pairs, share: chex.Array, key: chex.PRNGKey) -> Pairs:
-    """`pairs` after one more collect that brought `new`: each is replaced with probability `share`, by one of `new`
+    """`pairs` after one more rollout that brought `new`: each is replaced with probability `share`, by one of `new`
     drawn uniformly.
 
     share: of `new` in all that was collected since the last evaluation, `new` included; with that every pair is a

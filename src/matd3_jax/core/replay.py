@@ -1,7 +1,7 @@
 """Experience replay: a ring of flat transition rows for every seed, on the device.
 
 Rows are [seeds, capacity, row_size]. All seeds write equally much at the same time, so the write position is one number
-for all of them, derived from the count of collects: a write is one contiguous slice update with an explicit seed axis
+for all of them, derived from the count of rollouts: a write is one contiguous slice update with an explicit seed axis
 (under `vmap` it would turn into a scatter), and a batch is one gather.
 """
 
@@ -18,7 +18,7 @@ def allocate(num_seeds: int, capacity: int, row_size: int) -> chex.Array:
 
 
 def write(rows: chex.Array, new: chex.Array, count: chex.Array) -> chex.Array:
-    """Write the rows `new` [seeds, n, row_size] of collect number `count` (from 0); n divides the capacity, so that no
+    """Write the rows `new` [seeds, n, row_size] of rollout number `count` (from 0); n divides the capacity, so that no
     write wraps."""
     capacity, n = rows.shape[1], new.shape[1]
     if capacity % n:
@@ -32,7 +32,7 @@ def filled(capacity: int, n: int, count: chex.Array | int) -> chex.Array:
 
 
 class Written(NamedTuple):
-    """What has been written: `count` collects of n rows each into `capacity` rows."""
+    """What has been written: `count` rollouts of n rows each into `capacity` rows."""
 
     capacity: int
     n: int
@@ -45,8 +45,8 @@ def successors(written: Written, indices: chex.Array, stride: int, steps: int) -
 
     Args:
         indices: numbers of rows that are there.
-        stride: rows from one of an environment to its next: a collect's rows are time-major [length, num_envs], and
-            the next collect follows.
+        stride: rows from one of an environment to its next: a rollout's rows are time-major [length, num_envs], and
+            the next rollout follows.
     """
     capacity, n, count = written
     size = filled(capacity, n, count)

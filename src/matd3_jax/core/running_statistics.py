@@ -14,7 +14,7 @@ LEAST_VARIANCE = 1e-8
 
 
 class Statistics(NamedTuple):
-    """Of the joint observations x that one seed has acted on, prefill included."""
+    """Of the joint observations x that one seed has acted on, warm-up included."""
 
     mean: chex.Array
     """[observation_size]"""
@@ -27,13 +27,13 @@ def initial(size: int) -> Statistics:
     return Statistics(jnp.zeros(size), jnp.ones(size))
 
 
-def merge(statistics: Statistics, x: chex.Array, collects: chex.Array) -> Statistics:
-    """Statistics with x [rows, observation_size] of one more collect, after `collects` of the same size (pairwise
+def merge(statistics: Statistics, x: chex.Array, rollouts: chex.Array) -> Statistics:
+    """Statistics with x [rows, observation_size] of one more rollout, after `rollouts` of the same size (pairwise
     update of Chan, Golub and LeVeque 1983).
 
     Means of means and of variances instead of sums: nothing grows, and float32 lasts for any number of env steps.
     """
-    share = 1 / (collects + 1.0)
+    share = 1 / (rollouts + 1.0)
     mean, variance = x.mean(axis=0), x.var(axis=0)
     delta = mean - statistics.mean
     return Statistics(

@@ -20,7 +20,7 @@ from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.envs.environment import Environment
 from matd3_jax.envs.wrappers.joint_team import JointTeam
 from matd3_jax.training.loop import TrainState
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 TEAMS = ("agents", "adversaries")
 """The two sides, in the order of every axis [teams]."""
@@ -71,7 +71,7 @@ class Team(NamedTuple):
     """Leading axis [seeds]; actors and statistics of this team's agents only."""
 
 
-def team_of(training: Training, env: Environment, state: TrainState, team: str) -> Team:
+def team_of(training: TrainingSession, env: Environment, state: TrainState, team: str) -> Team:
     """One of the two teams that a run trained.
 
     Args:
@@ -115,7 +115,7 @@ def play(
     """Mean undiscounted returns [pairs, agents] of whole episodes between seeds of two teams, in float64.
 
     Every pair plays from the same start states and with the same randomness of the environment, those of
-    `Training.evaluate` with that `seed`; sampled policies draw their noise each team by itself.
+    `TrainingSession.evaluate` with that `seed`; sampled policies draw their noise each team by itself.
 
     Args:
         env: what both play in, without joining.

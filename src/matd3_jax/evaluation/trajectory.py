@@ -11,7 +11,7 @@ import numpy as np
 from matd3_jax.core import rollout
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.training.loop import TrainState
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 
 class Episode(NamedTuple):
@@ -65,7 +65,7 @@ class Episode(NamedTuple):
 
 
 def play(
-    training: Training,
+    training: TrainingSession,
     state: TrainState,
     seed: int = 0,
     number: int = 0,
@@ -75,8 +75,8 @@ def play(
 ) -> Episode:
     """Play an episode with the policies of one seed.
 
-    Deterministic, it is the episode `number` of those that `Training.evaluate` (and the command `evaluate`) plays with
-    its default seed.
+    Deterministic, it is the episode `number` of those that `TrainingSession.evaluate` (and the command `evaluate`)
+    plays with its default seed.
 
     Args:
         state: what was trained, leading axis [seeds].
@@ -110,7 +110,7 @@ def play(
         states = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), keep(first), later)
         return states, *rest
 
-    # The key of `Training.evaluate` with its default seed.
+    # The key of `TrainingSession.evaluate` with its default seed.
     key = jax.random.fold_in(jax.random.key(0), 2**31 - 1)
     states, reward, terminated, truncated = jax.jit(run)(policy, key)
     ended = np.flatnonzero(np.asarray(terminated | truncated))

@@ -37,7 +37,7 @@ class Series:
 def of_table(metrics: Mapping[str, np.ndarray], name: str, over: str = "step", window: float | None = None) -> Curves:
     """The column `name` of all seeds.
 
-    Seeds with the same rows keep their numbers. Otherwise (other chunk lengths, rows in which no episode of a seed
+    Seeds with the same rows keep their numbers. Otherwise (other interval lengths, rows in which no episode of a seed
     ended, episodes of different lengths drawn over episodes) the seed with the fewest rows gives the points; of the
     others each point takes the mean over what lies between it and the point before, or, of evaluations, which are made
     at one moment, the value interpolated to it. A seed's nan are left out between its values; where it has nan to its

@@ -18,8 +18,8 @@ from matd3_jax.errors import UserError
 class RunDirectory:
     """Where a run leaves its files.
 
-    config.yaml (all resolved settings), machine.json (versions and devices), metrics.csv (one row a chunk and seed),
-    checkpoints/, learning_curve.png, summary.json (written at the end), on request q_bias.png and tensorboard/.
+    config.yaml (all resolved settings), machine.json (versions and devices), metrics.csv (one row an interval and
+    seed), checkpoints/, learning_curve.png, summary.json (written at the end), on request q_bias.png and tensorboard/.
     """
 
     def __init__(self, path: Path):
@@ -81,7 +81,7 @@ class RunDirectory:
         partial.replace(self.metrics)
 
     def read_metrics(self) -> dict[str, np.ndarray]:
-        """The table as columns [rows], without the rows of a chunk that is just being written.
+        """The table as columns [rows], without the rows of an interval that is just being written.
 
         Raises UserError if there is none yet.
         """

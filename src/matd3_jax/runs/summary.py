@@ -12,7 +12,7 @@ def finals(metrics: dict[str, np.ndarray]) -> dict[str, tuple[float, float | Non
     late = metrics["step"] > 0.9 * metrics["step"].max()
     finals = {}
     for name in (name for name in metrics if name.startswith("return_")):
-        there = late & ~np.isnan(metrics[name])  # long episodes need not end within a chunk
+        there = late & ~np.isnan(metrics[name])  # long episodes need not end within an interval
         seeds = [metrics[name][there & (metrics["seed"] == s)] for s in np.unique(metrics["seed"])]
         if all(values.size for values in seeds):
             finals[name.removeprefix("return_")] = final(np.array([values.mean() for values in seeds]))

@@ -1,7 +1,7 @@
 """Several processes, on one host or several, that train one run: who they are, whose seeds are whose, what they tell
 each other.
 
-Seeds are independent, so each process trains its own with the ordinary program on its own devices. Every chunk the
+Seeds are independent, so each process trains its own with the ordinary program on its own devices. Every interval the
 others send the first their rows of the metrics table, and all agree whether to stop: nothing else is communicated.
 """
 

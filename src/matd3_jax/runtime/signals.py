@@ -7,7 +7,7 @@ from matd3_jax.runtime.multihost import Processes
 
 
 class Stop:
-    """SIGINT and SIGTERM end the run after the chunk at work; a second one ends it at once."""
+    """SIGINT and SIGTERM end the run after the interval at work; a second one ends it at once."""
 
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None
@@ -23,4 +23,4 @@ class Stop:
         if self.signal is not None:
             sys.exit(128 + number)
         self.signal = signal.Signals(number)
-        print(f"\n{self.signal.name}: writing a checkpoint after this chunk (again: stop at once)", flush=True)
+        print(f"\n{self.signal.name}: writing a checkpoint after this interval (again: stop at once)", flush=True)

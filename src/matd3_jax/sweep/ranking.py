@@ -106,7 +106,7 @@ def write(folder: Path, rows: Sequence[Ranked]) -> None:
 
 
 def _mean(values: np.ndarray) -> float:
-    there = values[~np.isnan(values)]  # no episode need have ended in a chunk
+    there = values[~np.isnan(values)]  # no episode need have ended in an interval
     return float(there.mean()) if there.size else np.nan
 
 

@@ -28,7 +28,7 @@ from matd3_jax.training import checkpoint
 from matd3_jax.training.loop import TrainState
 from matd3_jax.training.memory import fitting_seeds, needed
 from matd3_jax.training.progress import ProgressBar
-from matd3_jax.training.session import Row, Training
+from matd3_jax.training.session import Row, TrainingSession
 
 
 class Sweep:
@@ -126,7 +126,7 @@ class Piece:
         self.sweep, self.number, self.processes = sweep, number, processes
         self.runs = [RunDirectory(sweep.runs / name) for name in sweep.pieces[number]]
         self.members = sweep.members(number)
-        self.training = Training(self.members[0], members=self.members, processes=processes)
+        self.training = TrainingSession(self.members[0], members=self.members, processes=processes)
         self.checkpoints = sweep.folder / "pieces" / str(number) / "checkpoints"
         ends = np.cumsum([config.seeds for config in self.members])
         self.seeds = [slice(end - config.seeds, end) for end, config in zip(ends.tolist(), self.members, strict=True)]
@@ -183,7 +183,7 @@ class Piece:
             run.cut(done)
         if first:
             print(f"going on from the checkpoint of env step {done:,}", flush=True)
-        updates = self.training.trainer.updates(int(state.collects))
+        updates = self.training.trainer.updates(int(state.rollouts))
         return state, {"step": np.array([done]), "updates": np.array([updates])}
 
     def _append(self, row: Row) -> None:

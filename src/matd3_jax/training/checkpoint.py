@@ -22,7 +22,10 @@ import orbax.checkpoint as ocp
 from matd3_jax.core import replay
 from matd3_jax.errors import UserError
 from matd3_jax.runtime.multihost import ALONE, Share
-from matd3_jax.training.loop import Trainer, TrainState
+from matd3_jax.training.loop import TrainLoop, TrainState
+
+RENAMED = {".rollouts": ".collects"}
+"""Leaves by path, and what checkpoints from before call them."""
 
 logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax tells of every step at INFO and warns of its own defaults.
 
@@ -30,7 +33,7 @@ logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax tells of every step a
 def save(
     folder: Path,
     step: int,
-    trainer: Trainer,
+    trainer: TrainLoop,
     state: TrainState,
     keep: int,
     seeds: slice | None = None,
@@ -104,7 +107,7 @@ def verify(folder: Path, step: int | None = None) -> Path:
     return path
 
 
-def restore(path: Path, trainer: Trainer, share: Share | None = None) -> TrainState:
+def restore(path: Path, trainer: TrainLoop, share: Share | None = None) -> TrainState:
     """The state in the checkpoint at `path`, as `verify` gave it. Raises UserError if it holds no replay or does not
     fit the trainer.
 
@@ -115,7 +118,7 @@ def restore(path: Path, trainer: Trainer, share: Share | None = None) -> TrainSt
     share = share or ALONE.share(trainer.num_seeds)
     small = _rebuild(trainer, path, share)
     with ocp.StandardCheckpointer() as checkpointer:
-        filled = trainer.filled_rows(int(small.collects))
+        filled = trainer.filled_rows(int(small.rollouts))
         local = []
         for device, seeds in trainer.device_seeds():
             shape = (len(seeds), trainer.schedule.replay_capacity, trainer.layout.row_size)
@@ -131,7 +134,7 @@ def restore(path: Path, trainer: Trainer, share: Share | None = None) -> TrainSt
     return small._replace(replay=rows)
 
 
-def restore_actors(path: Path, trainer: Trainer) -> TrainState:
+def restore_actors(path: Path, trainer: TrainLoop) -> TrainState:
     """The state without its replay (an empty one in its place): enough to evaluate."""
     return _rebuild(trainer, path, ALONE.share(trainer.num_seeds))
 
@@ -160,9 +163,9 @@ def _put_rows(rows: jax.Array, one: jax.Array, place: int) -> jax.Array:
     return jax.lax.dynamic_update_slice(rows, one, (place, 0, 0))
 
 
-def _replay_rows(trainer: Trainer, state: TrainState):
+def _replay_rows(trainer: TrainLoop, state: TrainState):
     """(seed number, its filled rows) one after the other."""
-    filled = trainer.filled_rows(int(state.collects))
+    filled = trainer.filled_rows(int(state.rollouts))
     for shard in state.replay.addressable_shards:
         if shard.replica_id:
             continue  # a copy on another device that works on the same seeds
@@ -172,7 +175,7 @@ def _replay_rows(trainer: Trainer, state: TrainState):
                 yield first + place, np.asarray(shard.data[place, :filled])
 
 
-def _leaves(trainer: Trainer, state: TrainState, seeds: slice) -> dict[str, np.ndarray]:
+def _leaves(trainer: TrainLoop, state: TrainState, seeds: slice) -> dict[str, np.ndarray]:
     """All leaves but the replay by path, keys as their data, without the copies that fill up the devices; `seeds` of
     them."""
     plain = state._replace(replay=None, key=jax.random.key_data(state.key))  # type: ignore[arg-type]
@@ -181,7 +184,7 @@ def _leaves(trainer: Trainer, state: TrainState, seeds: slice) -> dict[str, np.n
     return {name: leaf[: trainer.num_seeds][seeds] if leaf.ndim else leaf for name, leaf in whole.items()}
 
 
-def _rebuild(trainer: Trainer, path: Path, share: Share) -> TrainState:
+def _rebuild(trainer: TrainLoop, path: Path, share: Share) -> TrainState:
     saved = read_state(path, share.first, share.last, share.total)
     template = trainer.abstract_state()
     shape = jax.eval_shape(jax.random.key_data, template.key)
@@ -189,7 +192,8 @@ def _rebuild(trainer: Trainer, path: Path, share: Share) -> TrainState:
     names, treedef = jax.tree_util.tree_flatten_with_path(template)
     leaves = []
     for name, leaf in names:
-        value = saved.get(jax.tree_util.keystr(name), np.array(np.nan))
+        path_of_leaf = jax.tree_util.keystr(name)
+        value = saved.get(path_of_leaf, saved.get(RENAMED.get(path_of_leaf, ""), np.array(np.nan)))
         wanted = (trainer.num_seeds, *leaf.shape[1:]) if leaf.ndim else ()
         if value.shape != wanted or value.dtype != leaf.dtype:
             raise UserError(f"{path}: {jax.tree_util.keystr(name)} does not fit these settings")

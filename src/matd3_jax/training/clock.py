@@ -32,7 +32,7 @@ class Clock:
 
     def __init__(self) -> None:
         self.training = 0.0
-        """Of the chunks: rollouts and updates."""
+        """Of the intervals: rollouts and updates."""
         self.evaluation = 0.0
         """Of all evaluations that were due."""
         self.evaluations = 0

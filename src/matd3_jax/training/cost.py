@@ -16,7 +16,7 @@ from matd3_jax.core import update
 from matd3_jax.core.agents import Group, JointLayout
 from matd3_jax.envs.environment import Environment
 from matd3_jax.training.schedule import Schedule
-from matd3_jax.training.session import Training
+from matd3_jax.training.session import TrainingSession
 
 REACHED = 0.6
 """Share of the rate of its products that the whole loop reaches (docs/performance.md: 0.54 to 0.72)."""
@@ -42,7 +42,7 @@ def update_flops(layout: JointLayout, schedule: Schedule) -> float:
 
 def step_flops(layout: JointLayout, schedule: Schedule) -> float:
     """Floating point operations of the matrix products in one env step of one seed once it learns."""
-    updates = schedule.updates_per_collect / schedule.collect_steps
+    updates = schedule.updates_per_collect / schedule.rollout_steps
     return acting_flops(layout) + updates * update_flops(layout, schedule)
 
 
@@ -165,7 +165,7 @@ def _repeated(program: Callable[[int], Any], wanted: float) -> tuple[int, float]
 # ---- said ------------------------------------------------------------------------------------------------------------
 
 
-def expectation(training: Training, done: int = 0) -> str:
+def expectation(training: TrainingSession, done: int = 0) -> str:
     """How long the run is going to take after env step `done`, and how that is known, in a line."""
     trainer, layout = training.trainer, training.layout
     schedule = trainer.schedule
@@ -181,12 +181,12 @@ def expectation(training: Training, done: int = 0) -> str:
     products = product_rate(places, *shape)
     physics = physics_rate(training.env, places, trainer.local_seeds * schedule.num_envs)
     steps = training.total_steps - done
-    learning = training.total_steps - max(done, trainer.prefill_steps)
-    evaluations = training.evaluations_after(max(done, trainer.prefill_steps))
+    learning = training.total_steps - max(done, trainer.warmup_steps)
+    evaluations = training.evaluations_after(max(done, trainer.warmup_steps))
     if not done and training.eval_every:
         evaluations += 1  # of the untrained policies
     evaluated = evaluations * training.config.eval_episodes * training.env.episode_length
-    updates = learning * schedule.updates_per_collect / schedule.collect_steps
+    updates = learning * schedule.updates_per_collect / schedule.rollout_steps
     flops = (steps + evaluated) * acting_flops(layout) + updates * update_flops(layout, schedule)
     seconds = trainer.rows * flops / (REACHED * products)
     how = f"products at {products / 1e9:.3g} GFLOP/s measured on these devices"

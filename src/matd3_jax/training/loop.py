@@ -24,15 +24,15 @@ from matd3_jax.training.schedule import Schedule
 
 
 class TrainState(NamedTuple):
-    """Everything that training carries; leading axis [seeds] but for `collects`."""
+    """Everything that training carries; leading axis [seeds] but for `rollouts`."""
 
     groups: tuple[GroupState, ...]
     env: EnvState
     replay: chex.Array
     """[seeds, capacity, row_size]"""
     key: chex.PRNGKey
-    collects: chex.Array
-    """int32 scalar: collects done, prefill included. Steps, updates and the replay's cursor follow from it."""
+    rollouts: chex.Array
+    """int32 scalar: rollouts done, warm-up included. Steps, updates and the replay's cursor follow from it."""
     statistics: Statistics | None = None
     """Of the observations collected; None where they are not normalised."""
     reservoir: Reservoir | None = None
@@ -40,12 +40,12 @@ class TrainState(NamedTuple):
 
 
 class Metrics(NamedTuple):
-    """Of one chunk: leading axes [seeds, cycles]."""
+    """Of one interval: leading axes [seeds, iterations]."""
 
     episodes: Episodes
-    """Sums over the episodes that ended in the cycle."""
+    """Sums over the episodes that ended in the iteration."""
     update: UpdateMetrics
-    """Means over the updates of the cycle (actor_loss over those that moved the actor)."""
+    """Means over the updates of the iteration (actor_loss over those that moved the actor)."""
 
 
 def idle_devices(devices: int, seeds: int, batch_size: int) -> int:
@@ -54,7 +54,7 @@ def idle_devices(devices: int, seeds: int, batch_size: int) -> int:
     return 2 if devices >= 2 * seeds and batch_size % 2 == 0 else 1
 
 
-class Trainer:
+class TrainLoop:
     """Programs that start and advance the training of `num_seeds` seeds.
 
     Args:
@@ -71,9 +71,9 @@ class Trainer:
         least_deviation: of what observations are normalized by.
         q_bias_pairs: states and actions that each seed keeps for `measure_q_bias`; 0: none, and no trace of it in the
             programs.
-        unroll: cycles of a chunk, and updates of a collect with many, that one iteration of their loop holds; longer
-            iterations are more to compile and fewer launches of an accelerator. The numbers stay the same.
-        unroll_steps: the same of the env steps of a collect.
+        unroll: how many iterations, and updates after a rollout with many, one pass of their compiled loop holds;
+            longer passes are more to compile and fewer launches of an accelerator. The numbers stay the same.
+        unroll_steps: the same of the env steps of a rollout.
     """
 
     def __init__(
@@ -130,34 +130,34 @@ class Trainer:
         return math.lcm(*(group.algorithm.policy_delay for group in self.layout.groups))
 
     @cached_property
-    def cycle_collects(self) -> int:
+    def rollouts_per_iteration(self) -> int:
         return math.lcm(self.period, self.schedule.updates_per_collect) // self.schedule.updates_per_collect
 
     @property
-    def cycle_steps(self) -> int:
-        """Env steps of one cycle, each seed."""
-        return self.cycle_collects * self.schedule.collect_steps
+    def iteration_steps(self) -> int:
+        """Env steps of one iteration, each seed."""
+        return self.rollouts_per_iteration * self.schedule.rollout_steps
 
     @property
-    def prefill_steps(self) -> int:
-        return self.schedule.prefill_collects * self.schedule.collect_steps
+    def warmup_steps(self) -> int:
+        return self.schedule.warmup_rollouts * self.schedule.rollout_steps
 
-    def env_steps(self, collects: int) -> int:
-        """Env steps a seed after `collects` collects."""
-        return collects * self.schedule.collect_steps
+    def env_steps(self, rollouts: int) -> int:
+        """Env steps a seed after `rollouts` rollouts."""
+        return rollouts * self.schedule.rollout_steps
 
-    def updates(self, collects: int) -> int:
-        """Updates a seed after `collects` collects."""
-        return max(0, collects - self.schedule.prefill_collects) * self.schedule.updates_per_collect
+    def updates(self, rollouts: int) -> int:
+        """Updates a seed after `rollouts` rollouts."""
+        return max(0, rollouts - self.schedule.warmup_rollouts) * self.schedule.updates_per_collect
 
     @property
     def replay_bytes(self) -> int:
         """Memory of the replay of all seeds, on all devices that have it."""
         return 4 * self.devices_per_seed * self.rows * self.schedule.replay_capacity * self.layout.row_size
 
-    def filled_rows(self, collects: int) -> int:
-        """Transitions in each seed's replay after `collects` collects."""
-        return int(replay.filled(self.schedule.replay_capacity, self.schedule.collect_steps, collects))
+    def filled_rows(self, rollouts: int) -> int:
+        """Transitions in each seed's replay after `rollouts` rollouts."""
+        return int(replay.filled(self.schedule.replay_capacity, self.schedule.rollout_steps, rollouts))
 
     # ---- seeds over devices ------------------------------------------------------------------------------------------
 
@@ -277,28 +277,28 @@ class Trainer:
         if state.reservoir is not None:
             # A key apart from those that `rollout.collect` splits off the same one: training stays as it is without.
             apart = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys[:, 0], rollout.APART)
-            share = 1 / (state.collects + 1.0 - state.reservoir.since)
+            share = 1 / (state.rollouts + 1.0 - state.reservoir.since)
             new = Pairs(states, self.layout.row_parts(rows).inputs)
             pairs = jax.vmap(q_bias.keep, in_axes=(0, 0, None, 0))(state.reservoir.pairs, new, share, apart)
             state = state._replace(reservoir=state.reservoir._replace(pairs=pairs))
         if state.statistics is not None:
             x = self.layout.row_parts(rows).x
             merge = jax.vmap(running_statistics.merge, in_axes=(0, 0, None))
-            state = state._replace(statistics=merge(state.statistics, x, state.collects))
-        rows = replay.write(state.replay, rows, state.collects)
-        state = state._replace(env=env, replay=rows, key=keys[:, 1], collects=state.collects + 1)
+            state = state._replace(statistics=merge(state.statistics, x, state.rollouts))
+        rows = replay.write(state.replay, rows, state.rollouts)
+        state = state._replace(env=env, replay=rows, key=keys[:, 1], rollouts=state.rollouts + 1)
         return state, episodes
 
     @cached_property
-    def prefill(self) -> "Program":
-        """Play `prefill_collects` collects without learning: (state, episodes [seeds, collects])."""
+    def warm_up(self) -> "Program":
+        """Play `warmup_rollouts` rollouts without learning: (state, episodes [seeds, rollouts])."""
         random = self.schedule.warmup == "random"
-        return self.program(partial(self.collect, random=random), self.schedule.prefill_collects)
+        return self.program(partial(self.rollout, random=random), self.schedule.warmup_rollouts)
 
     def learn(self, state: TrainState, hyper, first: int) -> tuple[TrainState, UpdateMetrics]:
-        """The updates after one collect, piece after piece of the local seeds; `first`: number of the first of them."""
+        """The updates after one rollout, piece after piece of the local seeds; `first`: number of the first of them."""
         schedule, groups = self.schedule, self.layout.groups
-        size = replay.filled(schedule.replay_capacity, schedule.collect_steps, state.collects)
+        size = replay.filled(schedule.replay_capacity, schedule.rollout_steps, state.rollouts)
         batches = 1 if schedule.shared_minibatch else self.layout.num_agents
         unrolled = math.gcd(self.period, schedule.updates_per_collect)
         axis = "minibatch" if self.devices_per_seed > 1 else None
@@ -328,11 +328,11 @@ class Trainer:
         keys = jax.vmap(partial(jax.random.split, num=2))(state.key)
         seeds = jnp.arange(keys.shape[0])
         states, metrics = jax.lax.map(one, (seeds, state.groups, keys[:, 0], hyper), batch_size=self.piece)
-        # The next collect writes where these updates read. Where the actor is delayed nothing else tells XLA to do one
-        # after the other, and it would copy the whole replay: so let the count of collects, hence the place of the next
+        # The next rollout writes where these updates read. Where the actor is delayed nothing else tells XLA to do one
+        # after the other, and it would copy the whole replay: so let the count of rollouts, hence the place of the next
         # write, hang on the updates. A mean squared error is never negative; XLA does not know.
         wait = jnp.any(metrics.critic_loss < 0).astype(jnp.int32)
-        return state._replace(groups=states, key=keys[:, 1], collects=state.collects + wait), metrics
+        return state._replace(groups=states, key=keys[:, 1], rollouts=state.rollouts + wait), metrics
 
     def minibatches(
         self, state: TrainState, hyper: Sequence[HyperParams], seed: chex.Array | int, indices: chex.Array
@@ -343,7 +343,7 @@ class Trainer:
         if layout.n_step == 1:
             rows = replay.gather(state.replay, seed, indices)
         else:
-            written = replay.Written(schedule.replay_capacity, schedule.collect_steps, state.collects)
+            written = replay.Written(schedule.replay_capacity, schedule.rollout_steps, state.rollouts)
             gamma = jnp.stack([jnp.asarray(hyper[layout.place(i)[0]].gamma) for i in range(layout.num_agents)])
             rows = n_step.draw(layout, state.replay, seed, indices, written, schedule.num_envs, gamma)
         scale = self.scale(state)
@@ -351,10 +351,10 @@ class Trainer:
             return rows
         return running_statistics.normalise_rows(self.layout, jax.tree.map(lambda s: s[seed], scale), rows)
 
-    def cycle(self, state: TrainState, hyper) -> tuple[TrainState, Metrics]:
+    def iteration(self, state: TrainState, hyper) -> tuple[TrainState, Metrics]:
         episodes, metrics = [], []
-        for c in range(self.cycle_collects):
-            state, e = self.collect(state, hyper)
+        for c in range(self.rollouts_per_iteration):
+            state, e = self.rollout(state, hyper)
             state, m = self.learn(state, hyper, first=c * self.schedule.updates_per_collect)
             episodes.append(e)
             metrics.append(m)
@@ -362,19 +362,23 @@ class Trainer:
         mean = jax.tree.map(lambda *m: jnp.nanmean(jnp.concatenate(m, axis=1), axis=1), *metrics)
         return state, Metrics(total, mean)
 
-    def chunk(self, cycles: int) -> "Program":
-        """The program of `cycles` cycles: (state, metrics [seeds, cycles]). The state given in is donated."""
-        return self.program(self.cycle, cycles)
+    def interval(self, iterations: int) -> "Program":
+        """The program of `iterations` iterations: (state, metrics [seeds, iterations]). The state given in is
+        donated."""
+        return self.program(self.iteration, iterations)
 
-    def program(self, cycle: Callable, cycles: int) -> "Program":
-        """`cycle`(state, hyper) -> (state, output) of the local seeds, repeated `cycles` times in one `lax.scan`."""
+    def program(self, iteration: Callable, iterations: int) -> "Program":
+        """`iteration`(state, hyper) -> (state, output) of the local seeds, repeated `iterations` times in one
+        `lax.scan`."""
 
         def repeat(state, hyper):
-            state, outputs = jax.lax.scan(lambda s, _: cycle(s, hyper), state, length=cycles, unroll=self.unroll)
+            state, outputs = jax.lax.scan(
+                lambda s, _: iteration(s, hyper), state, length=iterations, unroll=self.unroll
+            )
             return state, jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), outputs)
 
         specs = (self._specs, P("seeds"))
-        return Program(jax.jit(self._sharded(repeat, specs, specs), donate_argnums=0), self.hyper, cycles)
+        return Program(jax.jit(self._sharded(repeat, specs, specs), donate_argnums=0), self.hyper, iterations)
 
     def evaluate(self, state: TrainState, keys: chex.PRNGKey, episodes: int, deterministic: bool) -> Evaluation:
         """`rollout.evaluate` of each seed, leading axis [num_seeds]; one program for each kind and number of episodes.
@@ -417,7 +421,7 @@ class Trainer:
     def restart_reservoir(self, state: TrainState) -> TrainState:
         """Forget what the reservoir holds: after an evaluation."""
         assert state.reservoir is not None
-        since = jax.device_put(np.int32(state.collects), self.shardings.reservoir.since)  # type: ignore[union-attr]
+        since = jax.device_put(np.int32(state.rollouts), self.shardings.reservoir.since)  # type: ignore[union-attr]
         return state._replace(reservoir=state.reservoir._replace(since=since))
 
 
@@ -426,7 +430,7 @@ class Program(NamedTuple):
 
     jitted: Any
     hyper: tuple[HyperParams, ...]
-    cycles: int
+    iterations: int
 
     def __call__(self, state: TrainState) -> tuple[TrainState, Any]:
         return self.jitted(state, self.hyper)

@@ -7,14 +7,14 @@ import jax
 
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError
-from matd3_jax.training.loop import Trainer, idle_devices
-from matd3_jax.training.session import Training
+from matd3_jax.training.loop import TrainLoop, idle_devices
+from matd3_jax.training.session import TrainingSession
 
 PROCESS = 1_300_000_000
 """Bytes of the process itself: interpreter, libraries, compiler, programs (docs/performance.md)."""
 
 
-def needed(trainer: Trainer, seeds: int) -> int:
+def needed(trainer: TrainLoop, seeds: int) -> int:
     """Bytes that training `seeds` seeds takes at most, the process and its checkpoints included.
 
     Args:
@@ -31,17 +31,17 @@ def needed(trainer: Trainer, seeds: int) -> int:
     return PROCESS + copies * (replay + seed_bytes(trainer)) + together * update_bytes(trainer) + 2 * replay
 
 
-def seed_bytes(trainer: Trainer) -> int:
-    """Bytes of one seed beside its replay: its state, twice while it changes, and a collect with its fresh starts."""
+def seed_bytes(trainer: TrainLoop) -> int:
+    """Bytes of one seed beside its replay: its state, twice while it changes, and a rollout with its fresh starts."""
     schedule, layout = trainer.schedule, trainer.layout
     state = trainer.abstract_state()
-    whole = size(state._replace(replay=None, collects=None)) // trainer.rows  # type: ignore[arg-type]
+    whole = size(state._replace(replay=None, rollouts=None)) // trainer.rows  # type: ignore[arg-type]
     one_env = size(state.env) // (trainer.rows * schedule.num_envs)
-    # Each transition of a collect: its row, what it is packed from, and a fresh start.
-    return 2 * whole + schedule.collect_steps * (2 * 4 * layout.row_size + 2 * one_env)
+    # Each transition of a rollout: its row, what it is packed from, and a fresh start.
+    return 2 * whole + schedule.rollout_steps * (2 * 4 * layout.row_size + 2 * one_env)
 
 
-def update_bytes(trainer: Trainer) -> int:
+def update_bytes(trainer: TrainLoop) -> int:
     """Bytes that one seed's update takes beside its state: minibatches, noise, activations and their gradients."""
     layout, schedule = trainer.layout, trainer.schedule
     agents = 1 if trainer.on_cpu else layout.num_agents  # agents updated at the same time
@@ -54,7 +54,7 @@ def update_bytes(trainer: Trainer) -> int:
     return 4 * schedule.batch_size * (2 * rows + noise + agents * 4 * widest)
 
 
-def most_seeds(trainer: Trainer, budget: int) -> int:
+def most_seeds(trainer: TrainLoop, budget: int) -> int:
     """The largest number of seeds, a multiple of the devices where it can be, that `needed` says fit into `budget`
     bytes. Raises UserError, with the arithmetic, where not even one does."""
     if needed(trainer, 1) > budget:
@@ -75,7 +75,7 @@ def most_seeds(trainer: Trainer, budget: int) -> int:
 
 def fitting_seeds(config: Config, budget: int) -> int:
     """`most_seeds` of a run's settings."""
-    return most_seeds(Training(config).trainer, budget)
+    return most_seeds(TrainingSession(config).trainer, budget)
 
 
 def size(tree: chex.ArrayTree) -> int:

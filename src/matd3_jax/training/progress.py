@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from matd3_jax.training.clock import compiling
-from matd3_jax.training.session import Row, Training
+from matd3_jax.training.session import Row, TrainingSession
 
 SECONDS_BETWEEN_LINES = 10
 
@@ -24,7 +24,7 @@ class ProgressBar:
         row: where the run stands.
     """
 
-    def __init__(self, training: Training, row: Row):
+    def __init__(self, training: TrainingSession, row: Row):
         self.training, self.clock = training, training.clock
         self.total, self.seeds = training.total_steps, training.share.total
         self.step, self.updates = self.begun_step, self.begun_updates = int(row["step"][0]), int(row["updates"][0])
@@ -46,7 +46,7 @@ class ProgressBar:
             self.bar.start()
 
     def show(self, row: Row) -> None:
-        """Tell of one more chunk."""
+        """Tell of one more interval."""
         self.now, self.compiled = time.monotonic(), compiling()
         self._note(row)
         text = self.text()
@@ -70,7 +70,7 @@ class ProgressBar:
 
     def rates(self) -> dict[str, float]:
         """Env steps/s and updates/s over all seeds, of all the time but compiling; env steps/s of the training alone;
-        the share of evaluations in the time. Empty before the first chunk."""
+        the share of evaluations in the time. Empty before the first interval."""
         if self.step == self.begun_step:
             return {}
         return {

@@ -9,8 +9,9 @@ class Schedule:
     """Static.
 
     Collect `num_envs * rollout_length` env steps, then `updates_per_collect` updates; actors and targets move with
-    every policy_delay-th update. The unit that the scan repeats (a cycle) is the shortest stretch of whole collects
-    that holds every algorithm's delay a whole number of times, so that the delay is structure and not a condition.
+    every policy_delay-th update. The unit that the scan repeats (an iteration) is the shortest stretch of whole
+    rollouts that holds every algorithm's delay a whole number of times, so that the delay is structure and not a
+    condition.
     """
 
     num_envs: int = 4
@@ -18,7 +19,7 @@ class Schedule:
     updates_per_collect: int = 1
     batch_size: int = 1024
     replay_capacity: int = 1_000_000
-    """Transitions a seed; a multiple of `collect_steps`."""
+    """Transitions a seed; a multiple of `rollout_steps`."""
     learning_starts: int = 25_600
     """Transitions in the replay at the first update."""
     warmup: str = "policy"
@@ -29,11 +30,11 @@ class Schedule:
     """Update the agents one after another (see `update.update`)."""
 
     @property
-    def collect_steps(self) -> int:
-        """Env steps of one collect."""
+    def rollout_steps(self) -> int:
+        """Env steps of one rollout."""
         return self.num_envs * self.rollout_length
 
     @property
-    def prefill_collects(self) -> int:
-        """Collects before the loop: the first collect of the loop then reaches `learning_starts`."""
-        return max(0, math.ceil(self.learning_starts / self.collect_steps) - 1)
+    def warmup_rollouts(self) -> int:
+        """Rollouts before the loop: the first rollout of the loop then reaches `learning_starts`."""
+        return max(0, math.ceil(self.learning_starts / self.rollout_steps) - 1)

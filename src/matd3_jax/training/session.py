@@ -1,4 +1,4 @@
-"""A run from its settings: what `matd3_jax.train` returns, and what the command advances chunk by chunk."""
+"""A run from its settings: what `matd3_jax.train` returns, and what the command advances interval by interval."""
 
 import contextlib
 import dataclasses
@@ -23,11 +23,11 @@ from matd3_jax.runs import overestimation
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import ALONE, Processes
 from matd3_jax.training.clock import Clock
-from matd3_jax.training.loop import Metrics, Program, Trainer, TrainState
+from matd3_jax.training.loop import Metrics, Program, TrainLoop, TrainState
 from matd3_jax.training.schedule import Schedule
 
 Row = dict[str, np.ndarray]
-"""Columns of the metrics table for one chunk: each [seeds]; "step" and "seed" among them."""
+"""Columns of the metrics table for one interval: each [seeds]; "step" and "seed" among them."""
 
 
 EVALUATION_SPACING = 4
@@ -40,18 +40,18 @@ class Result:
     """What `train` returns."""
 
     config: Config
-    training: "Training"
+    training: "TrainingSession"
     state: TrainState
     """Everything trained, leading axis [seeds] (see `loop.TrainState`)."""
     metrics: dict[str, np.ndarray]
-    """Columns of the metrics table, each [seeds, chunks]; "step" is env steps of each seed."""
+    """Columns of the metrics table, each [seeds, intervals]; "step" is env steps of each seed."""
 
     def evaluate(self, episodes: int = 100, deterministic: bool = True, seed: int = 0) -> np.ndarray:
-        """Undiscounted returns [seeds, episodes, agents] of whole episodes (see `Training.evaluate`)."""
+        """Undiscounted returns [seeds, episodes, agents] of whole episodes (see `TrainingSession.evaluate`)."""
         return self.training.evaluate(self.state, episodes, deterministic, seed).episode_return
 
 
-class Training:
+class TrainingSession:
     """Programs and plan of one run, or of several that share a program (a piece of a sweep).
 
     Args:
@@ -105,19 +105,22 @@ class Training:
         local = jax.local_devices()
         least = config.normalise_least_deviation
         options: dict[str, Any] = {"normalise_observations": normalise, "least_deviation": least}
-        trainer = Trainer(self.env, self.layout, schedule, hyper, seeds, local, **options)
-        # Whole chunks of equal length, so that one compiled program does for all; as many as come closest to log_every.
-        cycles = max(1, math.ceil((config.total_steps - trainer.prefill_steps) / trainer.cycle_steps))
-        wanted = max(1, round((config.log_every or config.total_steps / 100) / trainer.cycle_steps))
-        self.num_chunks = math.ceil(cycles / wanted)
-        self.cycles_per_chunk = math.ceil(cycles / self.num_chunks)
-        self.total_steps = trainer.prefill_steps + self.num_chunks * self.cycles_per_chunk * trainer.cycle_steps
-        """Env steps of each seed: the first whole chunk at or after the wanted number."""
+        trainer = TrainLoop(self.env, self.layout, schedule, hyper, seeds, local, **options)
+        # Whole intervals of equal length, so that one compiled program does for all; as many as come closest to
+        # log_every.
+        iterations = max(1, math.ceil((config.total_steps - trainer.warmup_steps) / trainer.iteration_steps))
+        wanted = max(1, round((config.log_every or config.total_steps / 100) / trainer.iteration_steps))
+        self.num_intervals = math.ceil(iterations / wanted)
+        self.iterations_per_interval = math.ceil(iterations / self.num_intervals)
+        self.total_steps = (
+            trainer.warmup_steps + self.num_intervals * self.iterations_per_interval * trainer.iteration_steps
+        )
+        """Env steps of each seed: the first whole interval at or after the wanted number."""
         # Rows that would never be written are not allocated: the same result in less memory.
         capacity = min(config.replay_capacity, self.total_steps)
         schedule = dataclasses.replace(schedule, replay_capacity=capacity)
         kept = config.diagnostics.q_bias_rollouts if config.diagnostics.q_bias else 0
-        self.trainer = Trainer(self.env, self.layout, schedule, hyper, seeds, local, q_bias_pairs=kept, **options)
+        self.trainer = TrainLoop(self.env, self.layout, schedule, hyper, seeds, local, q_bias_pairs=kept, **options)
 
     def _hyper(self, team: str) -> HyperParams:
         """The team's hyper-parameters, leaves [seeds]."""
@@ -154,40 +157,40 @@ class Training:
         return jax.vmap(jax.random.key)(self.seeds)
 
     def start(self) -> tuple[TrainState, Row]:
-        """The state after the prefill, and what the untrained policies got there (of all processes in the first)."""
+        """The state after the warm-up, and what the untrained policies got there (of all processes in the first)."""
         self.check_memory()
-        state, episodes = self.trainer.prefill(self.trainer.init(self.keys()))
+        state, episodes = self.trainer.warm_up(self.trainer.init(self.keys()))
         row = self.row(state, Metrics(episodes, None))  # type: ignore[arg-type]
         state, columns = self._evaluated(state, due=True)
         return state, self.processes.gather(row | columns)
 
     @cached_property
-    def chunk(self) -> Program:
-        """The program of one chunk: compiled once."""
-        return self.trainer.chunk(self.cycles_per_chunk)
+    def interval(self) -> Program:
+        """The program of one interval: compiled once."""
+        return self.trainer.interval(self.iterations_per_interval)
 
     def advance(self, state: TrainState) -> tuple[TrainState, Row]:
-        """One chunk, and an evaluation where one is due; the row has the seeds of all processes in the first of them.
-        The state given in is donated."""
+        """One interval, and an evaluation where one is due; the row has the seeds of all processes in the first of
+        them. The state given in is donated."""
         before = self.step(state)
         with self.clock.train():
-            state, metrics = jax.block_until_ready(self.chunk(state))
+            state, metrics = jax.block_until_ready(self.interval(state))
         row = self.row(state, metrics)
         state, columns = self._evaluated(state, self._due(before, self.step(state)))
         return state, self.processes.gather(row | columns)
 
     def step(self, state: TrainState) -> int:
         """Env steps of each seed so far."""
-        return self.trainer.env_steps(int(state.collects))
+        return self.trainer.env_steps(int(state.rollouts))
 
     def row(self, state: TrainState, metrics: Metrics) -> Row:
-        """The chunk's row of the metrics table for each seed."""
+        """The interval's row of the metrics table for each seed."""
         seeds = len(self.seeds)
-        collects = int(state.collects)
+        rollouts = int(state.rollouts)
         row: Row = {
-            "step": np.full(seeds, self.trainer.env_steps(collects)),
+            "step": np.full(seeds, self.trainer.env_steps(rollouts)),
             "seed": self.seeds,
-            "updates": np.full(seeds, self.trainer.updates(collects)),
+            "updates": np.full(seeds, self.trainer.updates(rollouts)),
         }
         episodes = Episodes(*(np.asarray(e, np.float64)[:seeds].sum(axis=1) for e in metrics.episodes))
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -223,14 +226,14 @@ class Training:
         return max(self.config.total_steps // 20, EVALUATION_SPACING * played)
 
     def _due(self, before: int, step: int) -> bool:
-        """Whether an evaluation ends the chunk from env step `before` to `step`."""
+        """Whether an evaluation ends the interval from env step `before` to `step`."""
         every = self.eval_every
         return every > 0 and (step // every > before // every or step >= self.total_steps)
 
     def evaluations_after(self, step: int) -> int:
-        """How many evaluations are to come after the chunk that ended at env step `step`."""
-        chunk = self.cycles_per_chunk * self.trainer.cycle_steps
-        ends = range(step, self.total_steps + chunk, chunk)
+        """How many evaluations are to come after the interval that ended at env step `step`."""
+        interval = self.iterations_per_interval * self.trainer.iteration_steps
+        ends = range(step, self.total_steps + interval, interval)
         return sum(map(self._due, ends[:-1], ends[1:]))
 
     def evaluate(self, state: TrainState, episodes: int, deterministic: bool, seed: int = 0) -> Evaluation:
@@ -276,7 +279,7 @@ class Training:
         if state.reservoir is None:
             return state, {}
         found = None
-        if due and int(state.collects) > int(state.reservoir.since):
+        if due and int(state.rollouts) > int(state.reservoir.since):
             found = self.trainer.measure_q_bias(state, self.config.diagnostics.q_bias_steps)
             state = self.trainer.restart_reservoir(state)
         return state, overestimation.columns(self.layout.agents, found, len(self.seeds))
@@ -296,7 +299,7 @@ def train(
 
     Args:
         env: a name, or an `Environment` of your own.
-        callback: called with every chunk's row (columns [seeds]) as it comes.
+        callback: called with every interval's row (columns [seeds]) as it comes.
 
     Raises UserError for settings that are unknown or impossible.
     """
@@ -306,10 +309,10 @@ def train(
     config = configuration.load(chosen if own is not None else [f"env={env}", *chosen])
     if own is not None:
         config = dataclasses.replace(config, env={"name": type(own).__name__})
-    training = Training(config, own)
+    training = TrainingSession(config, own)
     state, row = training.start()
     rows = [row]
-    for _ in range(training.num_chunks):
+    for _ in range(training.num_intervals):
         if callback is not None:
             callback(row)
         state, row = training.advance(state)
@@ -320,7 +323,7 @@ def train(
 
 
 def stack(rows: list[Row]) -> dict[str, np.ndarray]:
-    """Columns [seeds, chunks] of rows with columns [seeds]."""
+    """Columns [seeds, intervals] of rows with columns [seeds]."""
     return {name: np.stack([row[name] for row in rows], axis=1) for name in rows[0]}
 
 
