@@ -51,7 +51,7 @@ def row(step, **columns):
 
 def shown(bar, capsys, given):
     bar.printed = 0.0
-    bar.show(given)
+    bar.log(given)
     return capsys.readouterr().out.strip()
 
 

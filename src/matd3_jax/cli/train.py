@@ -1,7 +1,7 @@
 """`python -m matd3_jax.train env=simple_spread algo=matd3 seeds=4`: train, and leave a run directory."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,8 @@ from matd3_jax.runtime import devices, multihost, slurm
 from matd3_jax.runtime.multihost import Processes
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.training import checkpoint, cost
+from matd3_jax.training import run as training_run
+from matd3_jax.training.loggers import Logger, TableLogger, TensorBoardLogger
 from matd3_jax.training.loop import TrainState
 from matd3_jax.training.progress import ProgressBar
 from matd3_jax.training.session import Row, TrainingSession
@@ -68,7 +70,8 @@ def start(settings: Config, processes: Processes) -> int:
     """A fresh run."""
     training = TrainingSession(settings, processes=processes)
     training.check_memory()
-    _tensorboard_writer(settings, None)
+    if settings.tensorboard:
+        TensorBoardLogger.check()
     path = Path(settings.out) / (settings.name or _name(settings))
     machine = {"versions": devices.versions(), **processes.description()}
     if processes.first:
@@ -97,7 +100,8 @@ def resume(path: Path, step: Any, overrides: Sequence[str], processes: Processes
     if done >= training.total_steps:
         raise UserError(f"{path} is at env step {done:,} of {training.total_steps:,}: to go on, raise total_steps=")
     training.check_memory()
-    _tensorboard_writer(settings, None)
+    if settings.tensorboard:
+        TensorBoardLogger.check()
     if processes.first:
         _announce(training, run, done)
         print(f"going on from the checkpoint of env step {done:,}", flush=True)
@@ -112,43 +116,45 @@ def resume(path: Path, step: Any, overrides: Sequence[str], processes: Processes
 
 
 def _advance(training: TrainingSession, run: RunDirectory, state: TrainState, row: Row, stop: Stop) -> int:
-    """Interval after interval to the end, or until a signal comes. Of several processes the first alone tells of the
-    run, in files and on the terminal."""
-    settings, processes, begun = training.config, training.processes, time.monotonic()
-    step = saved = int(row["step"][0])
-    report = Report(training, run, row) if processes.first else None
-    every = training.total_steps / 5 if settings.checkpoint_every is None else settings.checkpoint_every
+    """Train to the end, or until a signal comes, and say what came of it. Of several processes the first alone speaks,
+    in files and on the terminal."""
+    settings, begun, first = training.config, time.monotonic(), training.processes.first
+    loggers: list[Logger] = []
+    if first:
+        progress = ProgressBar(training, row)
+        loggers = [TableLogger([run]), progress, *([TensorBoardLogger([run])] if settings.tensorboard else [])]
 
-    def save() -> None:
+    def save(state: TrainState, step: int) -> None:
         keep = settings.keep_checkpoints
         checkpoint.save(run.checkpoints, step, training.trainer, state, keep, share=training.share)
 
-    try:
-        stopped = stop.agreed(processes)
-        while step < training.total_steps and stopped is None:
-            state, row = training.advance(state)
-            step = int(row["step"][0])
-            if report is not None:
-                report.add(row)
-            if every and step - saved >= every and step < training.total_steps:
-                save()
-                saved = step
-            stopped = stop.agreed(processes)
-    finally:
-        if report is not None:
-            report.close()
-    save()
-    if report is None:
-        return 128 + stopped if stopped is not None and step < training.total_steps else 0
+    outcome = training_run.run(training, state, row, loggers, save, stop)
+    step = int(outcome.row["step"][0])
+    save(outcome.state, step)
+    if first:
+        _draw(training, run)
+    if outcome.stopped is not None:
+        if first:
+            print(f"stopped by {outcome.stopped.name} at env step {step:,}; go on with: "
+                  f"python -m matd3_jax.train resume={run.path}")  # fmt: skip
+        return 128 + outcome.stopped
+    if first:
+        _finish(training, run, outcome.row, {"seconds": round(time.monotonic() - begun, 1), **progress.rates()})
+    return 0
+
+
+def _draw(training: TrainingSession, run: RunDirectory) -> None:
+    """The figures of a run."""
     metrics = run.read_metrics()
     learning_curves.learning_curve(run.curve, metrics, _title(training))
-    if settings.diagnostics.q_bias:
+    if training.config.diagnostics.q_bias:
         q_bias.draw(run.q_bias, metrics, training.layout.by_team(), _title(training))
-    if stopped is not None and step < training.total_steps:
-        print(f"stopped by {stopped.name} at env step {step:,}; go on with: "
-              f"python -m matd3_jax.train resume={run.path}")  # fmt: skip
-        return 128 + stopped
-    facts = summary.summary(metrics, row, seconds=round(time.monotonic() - begun, 1), **report.progress.rates())
+
+
+def _finish(training: TrainingSession, run: RunDirectory, row: Row, times: Mapping[str, float]) -> None:
+    """The summary of a run, in its file and on the terminal."""
+    settings, metrics = training.config, run.read_metrics()
+    facts = summary.summary(metrics, row, **times)
     over = f"(95 % interval over {settings.seeds} seeds)"
     for team, final in facts["last_tenth"].items():
         print(f"mean training return of {team} over the last tenth: {summary.text(final, over)}")
@@ -163,7 +169,6 @@ def _advance(training: TrainingSession, run: RunDirectory, state: TrainState, ro
         print(f"estimated and true values: {run.q_bias}")
     run.write_summary(facts)
     print(f"learning curve: {run.curve}\nevaluate with: python -m matd3_jax.evaluate run={run.path}")
-    return 0
 
 
 def _announce(training: TrainingSession, run: RunDirectory, done: int = 0) -> None:
@@ -210,41 +215,3 @@ def _title(training: TrainingSession) -> str:
 def _name(settings: Config) -> str:
     against = f"-vs-{settings.adversary.name}" if settings.adversary else ""
     return f"{settings.env['name']}-{settings.algo.name}{against}-{time.strftime('%Y%m%d-%H%M%S')}"
-
-
-class Report:
-    """What a run tells while it goes: rows of the metrics table, progress, TensorBoard files where asked for."""
-
-    def __init__(self, training: TrainingSession, run: RunDirectory, row: Row):
-        self.run, self.progress = run, ProgressBar(training, row)
-        self.writer = _tensorboard_writer(training.config, run)
-
-    def add(self, row: Row) -> None:
-        """One more interval."""
-        self.run.append(row)
-        self.progress.show(row)
-        if self.writer is not None:
-            _to_tensorboard(self.writer, row)
-
-    def close(self) -> None:
-        self.progress.stop()
-        if self.writer is not None:
-            self.writer.close()
-
-
-def _tensorboard_writer(settings: Config, run: RunDirectory | None) -> Any:
-    """A writer if asked for; with run None only the check that there can be one. Raises UserError."""
-    if not settings.tensorboard:
-        return None
-    try:
-        from tensorboardX import SummaryWriter
-    except ImportError:
-        raise UserError("tensorboard=true needs tensorboardX: pip install 'matd3_jax[tensorboard]'") from None
-    return None if run is None else SummaryWriter(str(run.tensorboard))
-
-
-def _to_tensorboard(writer: Any, row: Row) -> None:
-    for name, values in row.items():
-        if name not in ("step", "seed") and not np.isnan(values).all():
-            for seed, value in zip(row["seed"], values, strict=True):
-                writer.add_scalar(f"{name}/seed_{seed}", value, int(row["step"][0]))

@@ -25,6 +25,8 @@ from matd3_jax.runtime.multihost import ALONE, Processes
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.sweep import batching
 from matd3_jax.training import checkpoint
+from matd3_jax.training import run as training_run
+from matd3_jax.training.loggers import Logger, TableLogger, TensorBoardLogger
 from matd3_jax.training.loop import TrainState
 from matd3_jax.training.memory import fitting_seeds, needed
 from matd3_jax.training.progress import ProgressBar
@@ -58,6 +60,8 @@ class Sweep:
 
         Raises UserError where a setting is impossible, or one seed of it does not fit.
         """
+        if any(config.tensorboard for config in settings.values()):
+            TensorBoardLogger.check()
         budget = devices.free_memory(self.processes.here) if budget is None else budget
         size = self.processes.size
         existing = batching.existing_runs(self.runs)
@@ -139,33 +143,22 @@ class Piece:
         if self.processes.first:
             self._announce()
         state, row = self._begin()
-        step = saved = int(row["step"][0])
-        every = training.total_steps / 5 if settings.checkpoint_every is None else settings.checkpoint_every
-        progress = ProgressBar(training, row) if self.processes.first else None
+        loggers: list[Logger] = []
+        if self.processes.first:
+            progress = ProgressBar(training, row)
+            loggers = [TableLogger(self.runs, self.seeds), progress]
+            if settings.tensorboard:
+                loggers.append(TensorBoardLogger(self.runs, self.seeds))
 
-        def save() -> None:
+        def save(state: TrainState, step: int) -> None:
             checkpoint.save(self.checkpoints, step, training.trainer, state, keep=1, share=training.share)
 
-        try:
-            stopped = stop.agreed(self.processes)
-            while step < training.total_steps and stopped is None:
-                state, row = training.advance(state)
-                step = int(row["step"][0])
-                if progress is not None:
-                    self._append(row)
-                    progress.show(row)
-                if every and step - saved >= every and step < training.total_steps:
-                    save()
-                    saved = step
-                stopped = stop.agreed(self.processes)
-        finally:
-            if progress is not None:
-                progress.stop()
-        if step < training.total_steps:
-            save()
+        outcome = training_run.run(training, state, row, loggers, save, stop)
+        if outcome.stopped is not None:
+            save(outcome.state, int(outcome.row["step"][0]))
             return
-        rates = {} if progress is None else progress.rates()
-        self._finish(state, row, {"seconds": round(time.monotonic() - begun, 1), **rates})
+        rates = progress.rates() if self.processes.first else {}
+        self._finish(outcome.state, outcome.row, {"seconds": round(time.monotonic() - begun, 1), **rates})
 
     def _begin(self) -> tuple[TrainState, Row]:
         first, tell = self.processes.first, self.processes.tell
@@ -174,7 +167,7 @@ class Piece:
                 run.clear()
             state, row = self.training.start()
             if first:
-                self._append(row)
+                TableLogger(self.runs, self.seeds).log(row)
             return state, row
         saved = Path(tell(str(checkpoint.verify(self.checkpoints)) if first else None))
         state, done = checkpoint.restore(saved, self.training.trainer, self.training.share), int(saved.name)
@@ -185,10 +178,6 @@ class Piece:
             print(f"going on from the checkpoint of env step {done:,}", flush=True)
         updates = self.training.trainer.updates(int(state.rollouts))
         return state, {"step": np.array([done]), "updates": np.array([updates])}
-
-    def _append(self, row: Row) -> None:
-        for run, seeds in zip(self.runs, self.seeds, strict=True):
-            run.append({name: values[seeds] for name, values in row.items()})
 
     def _finish(self, state: TrainState, row: Row, facts: Mapping[str, Any]) -> None:
         """Leave each run as if it had been trained alone, but for its replay."""

@@ -45,7 +45,7 @@ class ProgressBar:
             self.task = self.bar.add_task("compiling", total=self.total, completed=self.step)
             self.bar.start()
 
-    def show(self, row: Row) -> None:
+    def log(self, row: Row) -> None:
         """Tell of one more interval."""
         self.now, self.compiled = time.monotonic(), compiling()
         self._note(row)
@@ -80,7 +80,7 @@ class ProgressBar:
             "evaluation_share": self._evaluated / self._seconds,
         }
 
-    def stop(self) -> None:
+    def close(self) -> None:
         if self.bar is not None:
             self.bar.stop()
 

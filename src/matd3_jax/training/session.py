@@ -1,16 +1,15 @@
-"""A run from its settings: what `matd3_jax.train` returns, and what the command advances interval by interval."""
+"""A run from its settings: its programs, its plan, and its rows of the metrics table."""
 
 import contextlib
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
 import jax
 import numpy as np
 
-from matd3_jax import config as configuration
 from matd3_jax import envs
 from matd3_jax.config import Config
 from matd3_jax.core.agents import JointLayout
@@ -33,22 +32,6 @@ Row = dict[str, np.ndarray]
 EVALUATION_SPACING = 4
 """Env steps of training, at least, for each env step of an evaluation, by default. Evaluations cost no updates: they
 take some 3 % of a robot's training with the fast recipe, less with others."""
-
-
-@dataclasses.dataclass
-class Result:
-    """What `train` returns."""
-
-    config: Config
-    training: "TrainingSession"
-    state: TrainState
-    """Everything trained, leading axis [seeds] (see `loop.TrainState`)."""
-    metrics: dict[str, np.ndarray]
-    """Columns of the metrics table, each [seeds, intervals]; "step" is env steps of each seed."""
-
-    def evaluate(self, episodes: int = 100, deterministic: bool = True, seed: int = 0) -> np.ndarray:
-        """Undiscounted returns [seeds, episodes, agents] of whole episodes (see `TrainingSession.evaluate`)."""
-        return self.training.evaluate(self.state, episodes, deterministic, seed).episode_return
 
 
 class TrainingSession:
@@ -214,6 +197,12 @@ class TrainingSession:
         member = np.array([t == team for t in self.layout.teams])
         return np.where(member, self.env.return_weights, 0.0)
 
+    @property
+    def checkpoint_every(self) -> float:
+        """Env steps between checkpoints; 0: none on the way."""
+        every = self.config.checkpoint_every
+        return self.total_steps / 5 if every is None else every
+
     # ---- evaluation --------------------------------------------------------------------------------------------------
 
     @property
@@ -283,58 +272,3 @@ class TrainingSession:
             found = self.trainer.measure_q_bias(state, self.config.diagnostics.q_bias_steps)
             state = self.trainer.restart_reservoir(state)
         return state, overestimation.columns(self.layout.agents, found, len(self.seeds))
-
-
-def train(
-    *overrides: str,
-    env: str | Environment = "simple_spread",
-    algo: str = "matd3",
-    callback: Callable[[Row], None] | None = None,
-    **settings: Any,
-) -> Result:
-    """Train `seeds` runs side by side and return their states and metrics.
-
-    Takes what the command line takes: `train(env="simple_tag", algo="matd3", adversary="maddpg", seeds=8)`, and
-    single values as strings: `train("algo.lr=0.003", "env.num_good=2", ...)`. Writes no files.
-
-    Args:
-        env: a name, or an `Environment` of your own.
-        callback: called with every interval's row (columns [seeds]) as it comes.
-
-    Raises UserError for settings that are unknown or impossible.
-    """
-    devices.prepare()
-    own = None if isinstance(env, str) else env
-    chosen = [f"algo={algo}", *(f"{key}={_text(value)}" for key, value in settings.items()), *overrides]
-    config = configuration.load(chosen if own is not None else [f"env={env}", *chosen])
-    if own is not None:
-        config = dataclasses.replace(config, env={"name": type(own).__name__})
-    training = TrainingSession(config, own)
-    state, row = training.start()
-    rows = [row]
-    for _ in range(training.num_intervals):
-        if callback is not None:
-            callback(row)
-        state, row = training.advance(state)
-        rows.append(row)
-    if callback is not None:
-        callback(row)
-    return Result(config, training, state, stack(rows))
-
-
-def stack(rows: list[Row]) -> dict[str, np.ndarray]:
-    """Columns [seeds, intervals] of rows with columns [seeds]."""
-    return {name: np.stack([row[name] for row in rows], axis=1) for name in rows[0]}
-
-
-def _text(value: Any) -> str:
-    """A value in Hydra's grammar."""
-    if value is None:
-        return "null"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, Mapping):
-        return "{" + ",".join(f"{k}:{_text(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ",".join(map(_text, value)) + "]"
-    return str(value)
