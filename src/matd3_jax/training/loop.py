@@ -255,7 +255,7 @@ class TrainLoop:
             return state.statistics
         return running_statistics.floored(state.statistics, self.least_deviation)
 
-    def collect(self, state: TrainState, hyper, random: bool = False) -> tuple[TrainState, Episodes]:
+    def rollout(self, state: TrainState, hyper, random: bool = False) -> tuple[TrainState, Episodes]:
         """One collect of all local seeds."""
 
         def one(policy, env, key):
