@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, NullLocator
 
-from matd3_jax.figures.learning_curves import COLOURS, PAPER
+from matd3_jax.figures.learning_curves import COLORS, PAPER
 
 LABELS = {"seeds": "seeds", "agents": "agents", "replay": "transitions in each replay", "batch": "minibatch"}
 ORDERS = {"agents": (2, 3)}
@@ -36,13 +36,13 @@ def draw(path: Path, axes: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
         for (top, bottom), (name, points) in zip(grid.T, columns.items(), strict=True):
             x = np.array([point["value"] for point in points], float)
             times = 1000 * np.array([[p["cycle_seconds"], p["fastest"], p["slowest"]] for p in points])
-            top.fill_between(x, times[:, 1], times[:, 2], color=COLOURS[0], alpha=0.2, linewidth=0)
+            top.fill_between(x, times[:, 1], times[:, 2], color=COLORS[0], alpha=0.2, linewidth=0)
             flops = np.array([point["product_flops_of_a_cycle"] for point in points])
             expected = times[0, 0] * flops / flops[0]
-            top.plot(x, expected, color=COLOURS[2], linestyle=(0, (1, 1)), label="as the products")
+            top.plot(x, expected, color=COLORS[2], linestyle=(0, (1, 1)), label="as the products")
             _line(top, x, times[:, 0], 0, "measured")
-            for key, (colour, label) in MEMORY.items():
-                _line(bottom, x, np.array([point["memory"][key] / 1e6 for point in points]), colour, label)
+            for key, (color, label) in MEMORY.items():
+                _line(bottom, x, np.array([point["memory"][key] / 1e6 for point in points]), color, label)
             memory = np.array([point["memory"]["xla"] / 1e6 for point in points])
             _guides(top, x, times[0, 0], ORDERS.get(name, (1,)))
             _guides(bottom, x, memory[0], ORDERS.get(name, (1,)))
@@ -56,8 +56,8 @@ def draw(path: Path, axes: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
         figure.savefig(path, dpi=200)
 
 
-def _line(axis: Axes, x: np.ndarray, y: np.ndarray, colour: int, label: str) -> None:
-    axis.loglog(x, y, color=COLOURS[colour], linewidth=1.4, marker="o", markersize=3, label=label)
+def _line(axis: Axes, x: np.ndarray, y: np.ndarray, color: int, label: str) -> None:
+    axis.loglog(x, y, color=COLORS[color], linewidth=1.4, marker="o", markersize=3, label=label)
     axis.xaxis.set_minor_locator(NullLocator())
     axis.set_xticks(x, [f"{v:.0f}" if v < 10_000 else EngFormatter(sep="")(v) for v in x], rotation=45)
     axis.spines[["top", "right"]].set_visible(False)

@@ -7,7 +7,7 @@ devices: the rate of every matrix product of the loop, by itself and at its own 
 twins as the loop has them; on one device alone, and on all at once), and the memory's bandwidth. From these and the
 products of one iteration, counted by hand and again in the compiled program, follows the floor: the time that the
 products alone take, or the bytes that must be moved at least, whichever is more. Nothing else is in it: no bias, no
-ReLU, no random numbers, no sampling, no optimiser, no environment.
+ReLU, no random numbers, no sampling, no optimizer, no environment.
 """
 
 import dataclasses
@@ -164,7 +164,7 @@ def _batched(product: Product, together: int) -> Product:
 
 def least_bytes(trainer: TrainLoop, part: str = "loop") -> int:
     """Bytes of one iteration, all seeds, that cannot stay in a cache: minibatches read from the replay, new rows
-    written, networks and optimisers read and written once an update (twice for what is moved along)."""
+    written, networks and optimizers read and written once an update (twice for what is moved along)."""
     schedule, layout = trainer.schedule, trainer.layout
     batches = 1 if schedule.shared_minibatch else layout.num_agents
     state = memory.size(trainer.abstract_state().groups) // trainer.rows

@@ -81,7 +81,7 @@ def draw(table: Table, path: Path) -> None:
     figure, axes = figures.canvas(len(columns), width=5.0, height=4.0)
     for axis, column in zip(axes, columns, strict=True):
         for algo in dict.fromkeys(table["algo"].tolist()):
-            evaluations.draw(axis, table.where(algo=algo), column, figures.COLOURS[algo], figures.NAMES[algo])
+            evaluations.draw(axis, table.where(algo=algo), column, figures.COLORS[algo], figures.NAMES[algo])
     axes[0].legend(frameon=False, fontsize=8, loc="upper left")
     env = table["env"][0]
     if env in ("ant", "brax_ant"):

@@ -1,6 +1,6 @@
 """`python -m experiments.competitive`: MATD3 and MADDPG against each other on the four competitive tasks.
 
-Figure 4 of the paper: final return of the team in all four pairings of algorithms, normalised to 0 to 1 for each task.
+Figure 4 of the paper: final return of the team in all four pairings of algorithms, normalized to 0 to 1 for each task.
 The pairs are trained together in one environment. The team are the good agents, in Predator-Prey the three predators.
 """
 
@@ -55,7 +55,7 @@ def team_return(table: Table, env: str, team: str, single: str) -> np.ndarray | 
     return tidy.final(pairing(table, env, team, single), column)
 
 
-def normalised(table: Table, env: str) -> dict[tuple[str, str], np.ndarray]:
+def normalized(table: Table, env: str) -> dict[tuple[str, str], np.ndarray]:
     """The team's final returns by pairing, [seeds] each, mapped so that the worst trial of all pairings is 0 and the
     best is 1."""
     found = {(team, single): team_return(table, env, team, single) for team, single in PAIRINGS}
@@ -84,31 +84,31 @@ def draw(table: Table, path: Path) -> None:
     envs = [env for env in ENVS if env in table.values("env")]
     figure, axes = figures.canvas(len(envs), width=2.9, height=3.6)
     for axis, env in zip(axes, envs, strict=True):
-        values = normalised(table, env)
+        values = normalized(table, env)
         for place, pair in enumerate(PAIRINGS):
             if pair in values:
-                figures.bar(axis, place, values[pair], figures.COLOURS[pair[0]])
+                figures.bar(axis, place, values[pair], figures.COLORS[pair[0]])
         axis.set_xticks(range(len(PAIRINGS)), [f"vs\n{figures.NAMES[single]}" for _, single in PAIRINGS], fontsize=8)
-        for k, team in enumerate(ALGOS):  # below the opponents, the team: its bars have its colour
+        for k, team in enumerate(ALGOS):  # below the opponents, the team: its bars have its color
             axis.text(
                 2 * k + 0.5, -0.2, f"{figures.NAMES[team]} team", transform=axis.get_xaxis_transform(), ha="center",
-                color=figures.COLOURS[team], fontweight="bold", fontsize=9,
+                color=figures.COLORS[team], fontweight="bold", fontsize=9,
             )  # fmt: skip
         axis.set_xlim(-0.6, len(PAIRINGS) - 0.4)
         axis.set_title(figures.task(env), fontsize=11)
         seeds = {len(v) for v in values.values()}
         axis.set_xlabel(f"{'/'.join(map(str, sorted(seeds)))} seeds", labelpad=20, fontsize=9)
-    axes[0].set_ylabel("team's final return, normalised")
+    axes[0].set_ylabel("team's final return, normalized")
     figures.save(figure, path)
 
 
 def details(table: Table) -> list[str]:
     lines = [
-        "| task | team | against | seeds | env steps | team's final return (95 % interval) | normalised |",
+        "| task | team | against | seeds | env steps | team's final return (95 % interval) | normalized |",
         "|---|---|---|---|---|---|---|",
     ]
     for env in ENVS:
-        values = normalised(table, env) if env in table.values("env") else {}
+        values = normalized(table, env) if env in table.values("env") else {}
         for (team, single), scaled in values.items():
             found = team_return(table, env, team, single)
             steps = pairing(table, env, team, single).by_seed("step")[0, -1]
@@ -124,7 +124,7 @@ STUDY = Study(
     protocol="The paper: the team and the single agent each MATD3 or MADDPG, trained together, 20 trials of each of "
     "the four pairings, 60,000 episodes of 25 steps. A final return is the mean of the last 1,000 training episodes (a "
     "fifth of all in runs below 5,000), summed over the team's agents; in Predator-Prey the team are the predators. "
-    "The paper does not say how it normalised; here, for each task, the worst single trial of all pairings is 0 and "
+    "The paper does not say how it normalized; here, for each task, the worst single trial of all pairings is 0 and "
     "the best is 1. The direct comparison is a MATD3 team against a MADDPG opponent beside a MADDPG team against a "
     "MATD3 opponent; tests are on the returns as they are.",
     settings=settings,

@@ -96,7 +96,7 @@ def draw(table: Table, path: Path) -> None:
         for algo in ALGOS:
             part = table.where(env=env, algo=algo)
             if len(part):
-                figures.learning(axis, part, "return_agents", figures.COLOURS[algo], figures.NAMES[algo])
+                figures.learning(axis, part, "return_agents", figures.COLORS[algo], figures.NAMES[algo])
         axis.set_title(figures.task(env))
         axis.legend(frameon=False, loc="lower right")
     axes[0].set_ylabel("return, mean of the last 1,000 episodes")

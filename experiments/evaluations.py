@@ -27,14 +27,14 @@ def late(part: Table, share: float = 1 / 3, column: str = RETURN) -> np.ndarray 
     return values[:, steps > (1 - share) * steps[-1]].mean(axis=1)
 
 
-def draw(axis: Axes, part: Table, column: str, colour: str, label: str, style: str = "-") -> None:
+def draw(axis: Axes, part: Table, column: str, color: str, label: str, style: str = "-") -> None:
     """Mean and standard deviation over the seeds of ONE setting."""
     found = curve(part, column)
     assert found is not None
     steps, curves = found
     mean, spread = curves.mean(axis=0), curves.std(axis=0, ddof=1) if len(curves) > 1 else 0
-    axis.fill_between(steps, mean - spread, mean + spread, color=colour, alpha=0.2, linewidth=0)
-    axis.plot(steps, mean, style, color=colour, label=f"{label} ({figures.count(len(curves))})")
+    axis.fill_between(steps, mean - spread, mean + spread, color=color, alpha=0.2, linewidth=0)
+    axis.plot(steps, mean, style, color=color, label=f"{label} ({figures.count(len(curves))})")
     axis.set_xlabel("env steps of each seed")
     axis.set_ylabel(f"evaluation: {COLUMNS[column]}")
 

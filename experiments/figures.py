@@ -1,4 +1,4 @@
-"""How the figures and tables of the studies look: colours that the colour-blind tell apart, bands, bars, intervals."""
+"""How the figures and tables of the studies look: colors that the color-blind tell apart, bands, bars, intervals."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ from experiments.verdict import number
 from matd3_jax.stats.intervals import mean_interval
 
 NAMES = {"matd3": "MATD3", "maddpg": "MADDPG", "iltd3": "IL-TD3", "td3": "SA-TD3", "iddpg": "IDDPG", "ddpg": "DDPG"}
-COLOURS = {  # Okabe and Ito's
+COLORS = {  # Okabe and Ito's
     "matd3": "#0072B2",
     "maddpg": "#E69F00",
     "iltd3": "#009E73",
@@ -23,7 +23,7 @@ COLOURS = {  # Okabe and Ito's
     "ddpg": "#D55E00",
 }
 SERIES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9")
-"""For what has no colour of its own."""
+"""For what has no color of its own."""
 
 TASKS = {
     "simple_spread": "Cooperative Navigation",
@@ -58,18 +58,18 @@ def canvas(
     return figure, axes
 
 
-def band(axis: Axes, x: np.ndarray, curves: np.ndarray, colour: str, label: str, style: str = "-") -> None:
+def band(axis: Axes, x: np.ndarray, curves: np.ndarray, color: str, label: str, style: str = "-") -> None:
     """Mean of curves [seeds, points] with its 95 % interval, the number of seeds in the legend."""
     mean, half = mean_interval(curves)
     if len(curves) > 1:
-        axis.fill_between(x, mean - half, mean + half, color=colour, alpha=0.22, linewidth=0)
-    axis.plot(x, mean, style, color=colour, label=f"{label} ({count(len(curves))})")
+        axis.fill_between(x, mean - half, mean + half, color=color, alpha=0.22, linewidth=0)
+    axis.plot(x, mean, style, color=color, label=f"{label} ({count(len(curves))})")
 
 
-def bar(axis: Axes, place: float, values: np.ndarray, colour: str, width: float = 0.8) -> None:
+def bar(axis: Axes, place: float, values: np.ndarray, color: str, width: float = 0.8) -> None:
     """Mean of values [seeds] with its 95 % interval, and each of them as a dot."""
     mean, half = mean_interval(values)
-    axis.bar(place, mean, width, color=colour, alpha=0.75, zorder=2)
+    axis.bar(place, mean, width, color=color, alpha=0.75, zorder=2)
     if len(values) > 1:
         axis.errorbar(place, mean, half, color="black", capsize=3, linewidth=1.2, zorder=4)
     across = place + np.linspace(-0.25, 0.25, len(values)) * width if len(values) > 1 else [place]
@@ -84,10 +84,10 @@ def save(figure: Figure, path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-def learning(axis: Axes, table: Table, name: str, colour: str, label: str, style: str = "-") -> None:
+def learning(axis: Axes, table: Table, name: str, color: str, label: str, style: str = "-") -> None:
     """The mean return of the last episodes along training of ONE setting, a band over episodes in thousands."""
     episodes, means = tidy.trailing(table, name)
-    band(axis, episodes / 1000, means, colour, label, style)
+    band(axis, episodes / 1000, means, color, label, style)
     axis.set_xlabel("episodes (thousands)")
 
 

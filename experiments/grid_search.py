@@ -101,7 +101,7 @@ def claims(table: Table) -> list[Claim]:
         return [Claim(paper, "final return: this setting less the best other one")]
     other = ranks[1 if place == 0 else 0]
     told = ", ".join(f"{key} {other[0][key]:g}" for key in wanted)
-    more = f"; it ranks {place + 1} of {len(ranks)} (to have picked the best of the others favours them)"
+    more = f"; it ranks {place + 1} of {len(ranks)} (to have picked the best of the others favors them)"
     return [verdict.compare(paper, "final return", (name, ranks[place][1]), (told, other[1]), more=more)]
 
 
@@ -114,10 +114,10 @@ def draw(table: Table, path: Path) -> None:
     figure, (axis,) = figures.canvas(1, width=6.2, height=1.2 + 0.27 * len(ranks))
     for k, (_, final, _) in enumerate(ranks):
         mean, half = mean_interval(final)
-        colour = figures.COLOURS["matd3"]
+        color = figures.COLORS["matd3"]
         if len(final) > 1:
-            axis.errorbar(mean, k, xerr=half, color=colour, capsize=3, linewidth=1.2)
-        axis.plot(mean, k, "o", color=colour)
+            axis.errorbar(mean, k, xerr=half, color=color, capsize=3, linewidth=1.2)
+        axis.plot(mean, k, "o", color=color)
         axis.plot(final, np.full(len(final), k), ".", color="black", markersize=3, alpha=0.45)
     labels = [", ".join(f"{key} {point[key]:g}" for key in wanted) for point, *_ in ranks]
     axis.set_yticks(range(len(ranks)), labels, fontsize=8)
@@ -125,9 +125,9 @@ def draw(table: Table, path: Path) -> None:
         if _is(point, wanted):
             label.set_fontweight("bold")
             axis.axhspan(k - 0.45, k + 0.45, color=figures.SERIES[1], alpha=0.25, linewidth=0)
-    centre = [final.mean() for _, final, _ in ranks]
+    center = [final.mean() for _, final, _ in ranks]
     axis.set_ylim(len(ranks) - 0.4, -0.6)
-    middle, reach = np.nanmedian(centre), 1.3 * np.nanmax(np.abs(centre - np.nanmedian(centre))) + 1e-6
+    middle, reach = np.nanmedian(center), 1.3 * np.nanmax(np.abs(center - np.nanmedian(center))) + 1e-6
     axis.set_xlim(middle - 1.5 * reach, middle + 1.5 * reach)  # intervals of few seeds may reach far beyond
     axis.set_xlabel("final return, mean and 95 % interval (shaded: the paper's best)")
     axis.set_title("the Ant" if robot(table) else "MATD3")

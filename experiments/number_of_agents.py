@@ -72,10 +72,10 @@ def draw(table: Table, path: Path) -> None:
     for k, algo in enumerate(ALGOS):
         values = relative(table, algo)
         for place, number in enumerate(values):
-            figures.bar(axis, place + 0.4 * (k - 0.5), 100 * values[number], figures.COLOURS[algo], width=0.36)
+            figures.bar(axis, place + 0.4 * (k - 0.5), 100 * values[number], figures.COLORS[algo], width=0.36)
         if values:
             seeds = "/".join(sorted({str(len(v)) for v in values.values()}))
-            axis.bar(0, 0, color=figures.COLOURS[algo], alpha=0.75, label=f"{figures.NAMES[algo]} ({seeds} seeds)")
+            axis.bar(0, 0, color=figures.COLORS[algo], alpha=0.75, label=f"{figures.NAMES[algo]} ({seeds} seeds)")
     numbers = table.values("num_agents")
     axis.set_xticks(range(len(numbers)), [f"{number:g}" for number in numbers])
     axis.axhline(0, color="black", linewidth=0.8)

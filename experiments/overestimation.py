@@ -165,19 +165,19 @@ def draw(table: Table, path: Path) -> None:
         if found is None:
             continue
         steps, estimate, truth = found
-        figures.band(axis, steps / 1e6, estimate, figures.COLOURS[algo], "critics' estimate")
+        figures.band(axis, steps / 1e6, estimate, figures.COLORS[algo], "critics' estimate")
         figures.band(axis, steps / 1e6, truth, "#555555", "true value", "--")
         axis.legend(frameon=False)
         late = np.concatenate([values.mean(axis=0)[1 + len(steps) // 8 :] for values in (estimate, truth)])
         levels += [1.3 * late.min(initial=0.0), late.max(initial=0.0) + 10]  # the first ones lie far below
-        figures.band(axes[2], steps / 1e6, estimate - truth, figures.COLOURS[algo], figures.NAMES[algo])
+        figures.band(axes[2], steps / 1e6, estimate - truth, figures.COLORS[algo], figures.NAMES[algo])
         start = lag(table.where(algo=algo))
         if start is not None:
             label = f"{figures.NAMES[algo]}: lag of the targets"
-            axes[2].plot(steps / 1e6, start.mean(axis=0), ":", color=figures.COLOURS[algo], label=label)
+            axes[2].plot(steps / 1e6, start.mean(axis=0), ":", color=figures.COLORS[algo], label=label)
         final = tidy.final(table.where(algo=algo), "return_agents")
         if final is not None:
-            shade = figures.COLOURS[algo]
+            shade = figures.COLORS[algo]
             axes[3].plot((estimate - truth).mean(axis=1), final, "o", color=shade, label=figures.NAMES[algo])
     for axis in axes[:2]:
         if levels:

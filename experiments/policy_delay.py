@@ -90,10 +90,10 @@ def draw(table: Table, path: Path) -> None:
     panels = [panel for panel in panels if panel[0] in table.values("env")]
     figure, axes = figures.canvas(len(panels), width=4.0)
     for axis, (env, column, label) in zip(axes, panels, strict=True):
-        for d, colour in zip(DELAYS, figures.SERIES, strict=False):
+        for d, color in zip(DELAYS, figures.SERIES, strict=False):
             part = table.where(env=env, policy_delay=d)
             if len(part):
-                figures.learning(axis, part, column, colour, f"d = {d}")
+                figures.learning(axis, part, column, color, f"d = {d}")
         axis.set_title(figures.task(env))
         axis.set_ylabel(f"{label},\nmean of the last 1,000 episodes")
         axis.legend(frameon=False, loc="best")

@@ -30,7 +30,7 @@ CHANGES: dict[str, list[str]] = {
     "n-step 5": ["n_step=5"],
     "averaged actor": ["algo.actor_average=0.001"],
     "delay 1": ["algo.policy_delay=1"],
-    "normalized, deviation at least 0.1": ["normalise_observations=true", "normalise_least_deviation=0.1"],
+    "normalized, deviation at least 0.1": ["normalize_observations=true", "normalize_least_deviation=0.1"],
     "rewards scaled by 0.1": ["algo.reward_scale=0.1"],
     "n-step 1": ["n_step=1"],
     "a minibatch for each agent": ["shared_minibatch=false"],
@@ -49,7 +49,7 @@ KEYS = {
     "n_step": "n_step",
     "policy_delay": "algo.policy_delay",
     "shared_minibatch": "shared_minibatch",
-    "normalise_observations": "normalise_observations",
+    "normalize_observations": "normalize_observations",
     "reward_scale": "algo.reward_scale",
 }
 SCALES = {
@@ -104,8 +104,8 @@ def draw(table: Table, path: Path) -> None:
         assert values is not None
         mean, half = mean_interval(values)
         half = half if len(values) > 1 else 0.0
-        colour = figures.SERIES[1 if name == BASE else 0]
-        axis.errorbar(mean, place, xerr=half, fmt="o", color=colour, capsize=3)
+        color = figures.SERIES[1 if name == BASE else 0]
+        axis.errorbar(mean, place, xerr=half, fmt="o", color=color, capsize=3)
         axis.plot(values, np.full(len(values), place) + 0.2, ".", color="black", markersize=3, alpha=0.5)
     axis.set_yticks(range(len(there)), [f"{name} ({figures.count(len(there[name]))})" for name in reversed(there)])
     axis.set_xlabel("evaluations in the last third: mean and its 95 % interval over seeds")

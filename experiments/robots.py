@@ -60,7 +60,7 @@ def draw(table: Table, path: Path) -> None:
     there = [key for key in ROBOTS if len(_part(table, *key))]
     figure, axes = figures.canvas(len(there), columns=min(4, len(there)), width=3.6, height=3.0)
     for axis, key in zip(axes, there, strict=True):
-        evaluations.draw(axis, _part(table, *key), evaluations.RETURN, figures.COLOURS["matd3"], "MATD3")
+        evaluations.draw(axis, _part(table, *key), evaluations.RETURN, figures.COLORS["matd3"], "MATD3")
         axis.set_title(" ".join(key))
         axis.legend(frameon=False, fontsize=8, loc="upper left")
     figure.suptitle("recipe=fast: mean ± sd over seeds")

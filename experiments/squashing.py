@@ -1,7 +1,7 @@
 """`python -m experiments.squashing`: why the Ant stood still with sigmoid actors: squashing x actors' learning rate.
 
 The Ant in two halves, MATD3, 300,000 env steps: actions as low + range x sigmoid(output), as the paper has them, or as
-centre + half range x tanh(output), which is the sigmoid of twice the output. If the slope is the reason, a sigmoid with
+center + half range x tanh(output), which is the sigmoid of twice the output. If the slope is the reason, a sigmoid with
 twice the learning rate is a tanh.
 """
 
@@ -69,11 +69,11 @@ def draw(table: Table, path: Path) -> None:
     columns = [column for column in evaluations.COLUMNS if column in table]
     figure, axes = figures.canvas(len(columns), width=5.0, height=4.0)
     for axis, column in zip(axes, columns, strict=True):
-        for key, colour in zip(GRID, figures.SERIES, strict=False):
+        for key, color in zip(GRID, figures.SERIES, strict=False):
             part = table.where(actor_output=key[0], actor_lr=key[1])
             if len(part):
                 style = "-" if key[0] == "tanh" else "--"
-                evaluations.draw(axis, part, column, colour, name(*key), style)
+                evaluations.draw(axis, part, column, color, name(*key), style)
     axes[0].legend(frameon=False, fontsize=8, loc="upper left", title="squashing, actors' learning rate")
     figure.suptitle("Ant, two halves, MATD3: mean ± sd over seeds")
     figures.save(figure, path)

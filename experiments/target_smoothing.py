@@ -51,12 +51,12 @@ def claims(table: Table) -> list[Claim]:
 def draw(table: Table, path: Path) -> None:
     figure, (whole, late) = figures.canvas(2)
     lowest, highest = [], []
-    for sigma, colour in zip(LEVELS, figures.SERIES, strict=False):
+    for sigma, color in zip(LEVELS, figures.SERIES, strict=False):
         part = table.where(target_noise=sigma)
         if not len(part):
             continue
         for axis in (whole, late):
-            figures.learning(axis, part, "return_agents", colour, f"σ = {sigma}" if sigma else "no smoothing")
+            figures.learning(axis, part, "return_agents", color, f"σ = {sigma}" if sigma else "no smoothing")
         episodes, means = tidy.trailing(part, "return_agents")
         there = means[:, episodes >= episodes[-1] / 3].mean(axis=0)
         lowest.append(there.min())

@@ -18,7 +18,7 @@ OPTIONS = {
 
 @pytest.fixture(scope="session")
 def quickly_compiled():
-    """`jax.jit` with little optimisation, where this XLA knows the options."""
+    """`jax.jit` with little optimization, where this XLA knows the options."""
     try:
         jax.jit(lambda x: x + 1, compiler_options=OPTIONS)(0)
     except jax.errors.JaxRuntimeError:  # another backend or version: only slower

@@ -46,7 +46,7 @@ def measure(report: Report, scale: float) -> Row:
     tidy.write(table, report.out / "ant_wide.csv")
     figure, axes = figures.canvas(len(evaluations.COLUMNS), width=5.0, height=4.0)
     for axis, column in zip(axes, evaluations.COLUMNS, strict=True):
-        evaluations.draw(axis, table, column, figures.COLOURS["matd3"], "MATD3, recipe=wide")
+        evaluations.draw(axis, table, column, figures.COLORS["matd3"], "MATD3, recipe=wide")
     axes[0].legend(frameon=False)
     figures.save(figure, report.out / "ant_wide.png")
     final = table.by_seed(evaluations.RETURN)[:, -1]

@@ -73,7 +73,7 @@ def _flat(tree) -> np.ndarray:
 
 
 def replay_copies() -> int:
-    """Copies of the whole replay in the optimised program of an interval."""
+    """Copies of the whole replay in the optimized program of an interval."""
     trainer = TrainingSession(config.load(["seeds=4", "total_steps=100000"])).trainer
     state = trainer.abstract_state()
     shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.layout.row_size)

@@ -17,14 +17,14 @@ def draw(report: Report) -> None:
     figure, axes = figures.canvas(len(there))
     for axis, (part, rows) in zip(axes, there.items(), strict=True):
         title, label, kinds = PANELS[part]
-        for kind, colour in zip(kinds, figures.SERIES, strict=False):
+        for kind, color in zip(kinds, figures.SERIES, strict=False):
             points = sorted(
                 (place(part, row), row["env_steps_per_second"])
                 for name, row in rows.items()
                 if f"{kind}," in f"{name},"  # not mjx_fast for mjx
             )
             if points:
-                axis.loglog(*zip(*points, strict=True), "o-", color=colour, label=kind)
+                axis.loglog(*zip(*points, strict=True), "o-", color=color, label=kind)
         axis.set_title(title)
         axis.set_xlabel(label)
         axis.set_ylabel("env steps/s, all seeds together")

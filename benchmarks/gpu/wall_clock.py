@@ -97,10 +97,10 @@ def draw(out: Path) -> None:
     figure, (axis,) = figures.canvas(1, width=6.0, height=4.0)
     curves = {"CPU": recorded()}
     curves |= {f"here, {name}": tidy.read(out / f"simple_spread_{name}.csv") for name in ("default", "float32")}
-    for (label, table), colour in zip(curves.items(), figures.SERIES, strict=False):
+    for (label, table), color in zip(curves.items(), figures.SERIES, strict=False):
         if len(table):
             episodes, means = trailing(table)
-            figures.band(axis, episodes / 1000, means, colour, label)
+            figures.band(axis, episodes / 1000, means, color, label)
     axis.set_xlabel("episodes (thousands)")
     axis.set_ylabel("return, mean of the last 1,000 episodes")
     axis.set_title("MATD3 on simple_spread")

@@ -143,12 +143,12 @@ def test_many_curves_can_be_told_apart(drawn, tmp_path):
     looks = {(line.get_color(), line.get_linestyle(), line._unscaled_dash_pattern) for line in axis.lines}
     assert len(looks) == 12 and len(figure.legends) == 1 and axis.get_legend() is None
     assert axis.get_title() == "simple_spread, matd3"
-    # No grey twins and no faint ones: each colour has contrast to white, and to its neighbours in the order of drawing.
+    # No grey twins and no faint ones: each color has contrast to white, and to its neighbors in the order of drawing.
     luminance = [
-        matplotlib.colors.to_rgb(colour) @ np.array([0.2126, 0.7152, 0.0722]) for colour in learning_curves.COLOURS
+        matplotlib.colors.to_rgb(color) @ np.array([0.2126, 0.7152, 0.0722]) for color in learning_curves.COLORS
     ]
     assert max(luminance) < 0.75
-    assert len({(k % len(learning_curves.COLOURS), k % len(learning_curves.STYLES)) for k in range(35)}) == 35
+    assert len({(k % len(learning_curves.COLORS), k % len(learning_curves.STYLES)) for k in range(35)}) == 35
 
 
 @pytest.mark.parametrize(("name", "begins"), [("a.png", b"\x89PNG"), ("a.pdf", b"%PDF"), ("a.svg", b"<?xml")])
@@ -202,7 +202,7 @@ def some_runs(tmp_path_factory):
         (["runs=a", "labels=b,c"], "labels=b,c: names 2, but there are 1: matd3"),
         (["runs=a", "labels='b"], "quotation mark"),
         (["runs=a", "each=1"], "each=1: must be true or false"),
-        (["runs=a", "colour=red"], "there is no key 'colour'"),
+        (["runs=a", "color=red"], "there is no key 'color'"),
         (["runs=a", "y"], "cannot read 'y'"),
     ],
 )

@@ -25,7 +25,7 @@ from matd3_jax.video import encode, frames
 TINY = [
     "env=simple_push", "adversary=maddpg", "seeds=3", "seed=5", "algo.hidden=[8]", "adversary.hidden=[8]",
     "batch_size=16", "num_envs=2", "learning_starts=200", "replay_capacity=500", "total_steps=1000", "eval_every=0",
-    "normalise_observations=true",
+    "normalize_observations=true",
 ]  # fmt: skip
 
 
@@ -233,8 +233,8 @@ def striped(number: int) -> list[Image.Image]:
     return found
 
 
-def test_colours_survive_in_a_gif(tmp_path):
-    """Little of a colour on a large background, and 300 other colours in one frame."""
+def test_colors_survive_in_a_gif(tmp_path):
+    """Little of a color on a large background, and 300 other colors in one frame."""
     frames = striped(9)
     ramp = np.full((31, 45, 3), 255, np.uint8)
     ramp[:20] = np.linspace(0, 255, 20 * 45).reshape(20, 45, 1)

@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -30,7 +31,7 @@ TINY = [
 
 @pytest.fixture(scope="module", autouse=True)
 def quick(quick_jit):
-    """Every program of this module, but for those of processes of their own, compiles with little optimisation."""
+    """Every program of this module, but for those of processes of their own, compiles with little optimization."""
 
 
 def run(out: Path, *more: str) -> int:
@@ -166,19 +167,19 @@ def test_stopped_and_resumed_is_the_same_to_the_bit(whole, tmp_path, monkeypatch
     assert train.main([f"resume={cut}"]) == 0
     assert (cut / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
     ours, theirs = leaves(cut), leaves(whole)
-    assert ours.keys() == theirs.keys() and any("optimiser" in name for name in ours)
+    assert ours.keys() == theirs.keys() and any("optimizer" in name for name in ours)
     for name in ours:
         np.testing.assert_array_equal(ours[name], theirs[name], err_msg=name)
     assert np.abs(ours["replay 2"]).max(axis=1).min() > 0 and len(ours["replay 2"]) == 500
 
 
-def test_several_steps_and_normalised_observations_resume_to_the_bit(tmp_path):
+def test_several_steps_and_normalized_observations_resume_to_the_bit(tmp_path):
     """With what these carry: ends of episodes in the replay, statistics in the state. `evaluate` plays with the saved
     statistics: its numbers are those of the run's own last evaluation."""
     settings = [
         "env=point_reach", "algo=iddpg", "seeds=2", "algo.hidden=[8]", "batch_size=16", "learning_starts=100",
         "total_steps=900", "log_every=100", "replay_capacity=500", "checkpoint_every=300", "keep_checkpoints=9",
-        "n_step=3", "normalise_observations=true",
+        "n_step=3", "normalize_observations=true",
     ]  # fmt: skip
     assert train.main([*settings, f"out={tmp_path}", "name=full"]) == 0
     full = tmp_path / "full"
@@ -231,17 +232,21 @@ def test_damage_is_named_and_the_checkpoint_before_it_used_on_request(whole, tmp
 
 
 def test_checkpoints_from_before_a_leaf_was_renamed_are_read(whole, monkeypatch):
-    """They hold the count of rollouts under another name."""
+    """They hold the count of rollouts and the optimizers under other names."""
     read, settings = checkpoint.read_state, config.read(whole / "config.yaml")
     trainer, path = TrainingSession(settings).trainer, checkpoint.verify(whole / "checkpoints")
     state = checkpoint.restore_actors(path, trainer)
 
     def before(*args):
         found = read(*args)
-        return {".collects" if name == ".rollouts" else name: leaf for name, leaf in found.items()}
+        old = {name.replace(".rollouts", ".collects").replace("optimizer", "optimiser"): name for name in found}
+        assert sum(name not in found for name in old) > 2
+        return {name: found[now] for name, now in old.items()}
 
     monkeypatch.setattr(checkpoint, "read_state", before)
-    assert int(checkpoint.restore_actors(path, trainer).rollouts) == int(state.rollouts) > 0
+    again = checkpoint.restore_actors(path, trainer)
+    assert int(again.rollouts) == int(state.rollouts) > 0
+    jax.tree.map(np.testing.assert_array_equal, again.groups, state.groups)
 
 
 def test_a_missing_checksum_file_is_damage(whole, tmp_path):

@@ -18,7 +18,7 @@ PAPER = {
     "hidden": (64, 64),
     "clip": "variable",
     "max_grad_norm": 0.5,
-    "logit_regulariser": 1e-3,
+    "logit_regularizer": 1e-3,
     "target_noise": 0.0,
     "target_noise_clip": 0.5,
 }
@@ -103,6 +103,20 @@ def test_settings_of_a_run_from_before_a_key_mean_what_they_meant(tmp_path):
     kept["algo"] = {key: value for key, value in kept["algo"].items() if key not in config.ADDED_LATER["algo"]}
     (tmp_path / "config.yaml").write_text(json.dumps(kept))  # JSON is YAML
     assert config.read(tmp_path / "config.yaml") == old
+
+
+def test_keys_have_had_other_names(tmp_path):
+    """Runs from before are read; who writes an old name is told the new one."""
+    settings = config.load(["env=simple_tag", "adversary=maddpg", "normalize_observations=true"])
+    old = settings.to_dict()
+    old["normalise_observations"] = old.pop("normalize_observations")
+    old["normalise_least_deviation"] = old.pop("normalize_least_deviation")
+    for team in ("algo", "adversary"):
+        old[team]["logit_regulariser"] = old[team].pop("logit_regularizer")
+    (tmp_path / "config.yaml").write_text(json.dumps(old))
+    assert config.read(tmp_path / "config.yaml") == settings
+    with pytest.raises(UserError, match="it is called 'algo.logit_regularizer' now"):
+        config.load(["algo.logit_regulariser=0"])
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ ROBOTS = [
     for name in ("ant", "half_cheetah", "hopper", "walker2d", "humanoid", "swimmer")
 ]
 
-# tau, delay, smoothing, critics, whose critic, one agent in everybody's place: Ackermann et al. 2019, on decentralised
+# tau, delay, smoothing, critics, whose critic, one agent in everybody's place: Ackermann et al. 2019, on decentralized
 # controllers of robots; iddpg and ddpg, not in the paper, with iltd3's and td3's settings.
 ALGORITHMS = {
     "matd3": (0.01, 2, 0.2, 2, "central", False),
@@ -34,12 +34,12 @@ def test_the_papers_recipe_is_the_papers(env, algo):
     found = (a.tau, a.policy_delay, a.target_noise, a.num_critics, a.critic, a.joint)
     assert found == ALGORITHMS[algo]
     assert (a.actor_lr, a.critic_lr, a.gamma, a.exploration_noise) == (0.001, 0.001, 0.99, 0.1)
-    assert (a.hidden, a.target_noise_clip, a.clip, a.logit_regulariser) == ((400, 300), 0.5, "none", 0.0)
+    assert (a.hidden, a.target_noise_clip, a.clip, a.logit_regularizer) == ((400, 300), 0.5, "none", 0.0)
     assert (a.actor_output, a.actor_average, a.reward_scale) == ("sigmoid", 0.0, 1.0)
     schedule = (settings.num_envs, settings.rollout_length, settings.updates_per_collect, settings.batch_size)
     assert schedule == (1, 1, 1, 100)
     assert (settings.total_steps, settings.learning_starts, settings.warmup) == (1_000_000, 10_000, "random")
-    assert (settings.n_step, settings.normalise_observations, settings.shared_minibatch) == (1, False, False)
+    assert (settings.n_step, settings.normalize_observations, settings.shared_minibatch) == (1, False, False)
     assert settings.recipe == "paper"
 
 
@@ -112,7 +112,7 @@ def test_an_accelerator_changes_the_engine_and_no_setting_of_learning(monkeypatc
         (["env=ant", "algo.reward_scale=0"], "algo.reward_scale=0.0: must be positive"),
         (["env=ant", "algo.actor_average=2"], "algo.actor_average=2.0: must lie between 0 and 1"),
         (["env=ant", "algo.actor_output=relu"], "algo.actor_output='relu': must be one of sigmoid, tanh"),
-        (["env=ant", "normalise_least_deviation=0.1"], "goes with normalise_observations=true"),
+        (["env=ant", "normalize_least_deviation=0.1"], "goes with normalize_observations=true"),
         (["env=ant", "env.splt=halves"], "'split'"),
     ],
 )

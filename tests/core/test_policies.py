@@ -52,7 +52,7 @@ def test_hard_choices_are_exactly_one_hot():
 
 @pytest.mark.parametrize("squash", ["sigmoid", "tanh"])
 def test_box_actions(squash):
-    """low + (high - low) sigmoid(output), or centre + half range tanh(output); noise in half ranges, never out of the
+    """low + (high - low) sigmoid(output), or center + half range tanh(output); noise in half ranges, never out of the
     bounds; the deterministic action and the gradient as in the reference."""
     rng = np.random.default_rng(0)
     output, draw, weight = rng.normal(size=(3, 50, 2)) * 3

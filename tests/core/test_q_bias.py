@@ -120,7 +120,7 @@ def by_numpy(statistics, x):
 
 @functools.cache
 def on_points():
-    """(layout, policy, groups, pairs) of point_reach: own critics, normalised observations, exploration noise."""
+    """(layout, policy, groups, pairs) of point_reach: own critics, normalized observations, exploration noise."""
     rng = np.random.default_rng(3)
     layout = JointLayout.of(POINT, {"agents": IDDPG})
     groups = fresh(layout)
@@ -134,7 +134,7 @@ def on_points():
 
 
 def test_true_values_of_box_actions():
-    """Damped masses in NumPy, the actors' squashed outputs without noise on normalised observations, six env steps
+    """Damped masses in NumPy, the actors' squashed outputs without noise on normalized observations, six env steps
     though the time limit is three."""
     layout, policy, groups, pairs = on_points()
     got = play_out(POINT, layout, policy, pairs, 6)
@@ -171,7 +171,7 @@ def test_estimates_are_the_critics():
     np.testing.assert_allclose(got, np.stack([np.mean(both, axis=0), alone], axis=1), rtol=1e-4, atol=1e-5)
 
 
-def test_estimates_read_normalised_observations():
+def test_estimates_read_normalized_observations():
     layout, policy, groups, pairs = on_points()
     values = q_bias.measure(POINT, layout, policy, [g.critic for g in groups], pairs, jax.random.key(5), 2)
     x, action = np.split(np.asarray(pairs.inputs, np.float64), [12], axis=1)
@@ -261,8 +261,8 @@ def test_measuring_by_seed():
 
 
 def test_training_is_the_same_with_and_without():
-    """Networks, optimisers, replay, environments and keys; without, not a leaf of it. After the warm-up to the bit, and
-    so later as XLA compiles the loop by default; with little optimisation it rounds some sums otherwise."""
+    """Networks, optimizers, replay, environments and keys; without, not a leaf of it. After the warm-up to the bit, and
+    so later as XLA compiles the loop by default; with little optimization it rounds some sums otherwise."""
     on, off = (run(slots)[1] for slots in (SLOTS, 0))
     for k, (one, other) in enumerate(zip(on, off, strict=True)):
         assert other.reservoir is None
@@ -284,7 +284,7 @@ def test_an_evaluation_costs_no_second_compilation():
 SETTINGS = [
     "env=point_reach", "algo=iltd3", "seeds=2", "algo.hidden=[8]", "batch_size=16", "learning_starts=100",
     "total_steps=900", "log_every=100", "replay_capacity=500", "checkpoint_every=200", "keep_checkpoints=9",
-    "eval_every=400", "eval_episodes=2", "normalise_observations=true",
+    "eval_every=400", "eval_episodes=2", "normalize_observations=true",
     "diagnostics.q_bias=true", "diagnostics.q_bias_rollouts=7", "diagnostics.q_bias_steps=5",
 ]  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Observation normalisation: statistics against NumPy over everything collected, and wherever networks read."""
+"""Observation normalization: statistics against NumPy over everything collected, and wherever networks read."""
 
 import functools
 
@@ -27,10 +27,10 @@ SCHEDULE = Schedule(num_envs=3, rollout_length=4, batch_size=8, replay_capacity=
 pytestmark = pytest.mark.usefixtures("quick_jit")
 
 
-def trainer(n_step=1, normalise=True):
+def trainer(n_step=1, normalize=True):
     layout = JointLayout.of(ENV, {"agents": ALGORITHM}, n_step)
     hyper = {"agents": HYPER._replace(exploration_noise=0.0)}
-    return TrainLoop(ENV, layout, SCHEDULE, hyper, SEEDS, normalise_observations=normalise)
+    return TrainLoop(ENV, layout, SCHEDULE, hyper, SEEDS, normalize_observations=normalize)
 
 
 def in_numpy(state):
@@ -54,7 +54,7 @@ def run():
 
 
 def by_numpy(statistics, x):
-    """Normalised observations in float64, written from what docs/algorithms.md says."""
+    """Normalized observations in float64, written from what docs/algorithms.md says."""
     mean, variance = (np.asarray(part, np.float64) for part in statistics)
     return np.clip((x - mean) / np.sqrt(variance + 1e-8), -10, 10)
 
@@ -101,13 +101,13 @@ def test_float32_lasts():
 
 
 def test_bounds():
-    """Normalised values stop at +-10, constant entries give 0, and at the start nothing changes but for the bound."""
+    """Normalized values stop at +-10, constant entries give 0, and at the start nothing changes but for the bound."""
     statistics = Statistics(jnp.array([1.0, 0.5]), jnp.array([4.0, 0.0]))
-    got = running_statistics.normalise(statistics, jnp.array([[3.0, 0.5], [100.0, 0.6], [-100.0, 0.4]]))
+    got = running_statistics.normalize(statistics, jnp.array([[3.0, 0.5], [100.0, 0.6], [-100.0, 0.4]]))
     np.testing.assert_allclose(got, [[1, 0], [10, 10], [-10, -10]], atol=1e-6)
     x = jnp.array([[-3.0, 0.7, 20.0]])
     np.testing.assert_allclose(
-        running_statistics.normalise(running_statistics.initial(3), x), [[-3.0, 0.7, 10.0]], rtol=1e-6
+        running_statistics.normalize(running_statistics.initial(3), x), [[-3.0, 0.7, 10.0]], rtol=1e-6
     )
 
 
@@ -115,9 +115,9 @@ def test_a_floor_keeps_small_what_hardly_ever_moves():
     """Deviations below the floor count as the floor, others as they are: of what networks read, not of what is kept."""
     statistics = Statistics(jnp.array([1.0, 0.5, 0.0]), jnp.array([4.0, 0.0, 1e-6]))
     x = jnp.array([[3.0, 0.6, 0.02]])
-    got = running_statistics.normalise(running_statistics.floored(statistics, 0.1), x)
+    got = running_statistics.normalize(running_statistics.floored(statistics, 0.1), x)
     np.testing.assert_allclose(got, [[1, 1, 0.2]], atol=1e-5)
-    assert running_statistics.normalise(statistics, x)[0, 2] > 9
+    assert running_statistics.normalize(statistics, x)[0, 2] > 9
     t, state, _, _ = run()
     t.least_deviation = 0.4
     try:
@@ -144,7 +144,7 @@ def actions(groups, seed, x):
 
 
 @pytest.mark.parametrize("collect", [1, 5])
-def test_collecting_reads_normalised_observations(collect):
+def test_collecting_reads_normalized_observations(collect):
     """Without noise the stored actions are those of the actors, as they were, on the stored observations in units of
     the statistics of all rollouts before; the replay keeps observations raw (they are what the environment gives)."""
     _, _, states, rows = run()
@@ -159,7 +159,7 @@ def test_collecting_reads_normalised_observations(collect):
     np.testing.assert_allclose(row[:, 20:22], row[:, 2:4] - 0.1 * row[:, 18:20], atol=1e-6)
 
 
-def test_evaluation_reads_normalised_observations():
+def test_evaluation_reads_normalized_observations():
     """A deterministic episode of one env step, by hand."""
     t, state, states, _ = run()
     seed = 1
@@ -177,12 +177,12 @@ def test_evaluation_reads_normalised_observations():
 
 
 @pytest.mark.parametrize("n_step", [1, 3])
-def test_updates_read_normalised_observations(n_step):
+def test_updates_read_normalized_observations(n_step):
     """x and x' of minibatches in the units of the seed's statistics as they are now; nothing else in a row changes.
     Some entries reach the bound."""
     _, state, states, _ = run()
     state = state._replace(statistics=state.statistics._replace(variance=state.statistics.variance / 20))
-    t, plain = trainer(n_step), trainer(n_step, normalise=False)
+    t, plain = trainer(n_step), trainer(n_step, normalize=False)
     next_x = slice(18, 30)
     if n_step > 1:  # one entry more, before x'
         rows = jnp.split(state.replay, [18], axis=-1)
@@ -207,7 +207,7 @@ def test_updates_read_normalised_observations(n_step):
 
 def test_off_there_is_nothing_of_it():
     """No leaf in the state, hence none in the program and in checkpoints; on there are two."""
-    off, on = (trainer(normalise=flag).abstract_state() for flag in (False, True))
+    off, on = (trainer(normalize=flag).abstract_state() for flag in (False, True))
     assert off.statistics is None and len(jax.tree.leaves(on)) == len(jax.tree.leaves(off)) + 2
 
 

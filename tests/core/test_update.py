@@ -157,7 +157,7 @@ def test_some_norms_are_clipped_and_some_are_not():
         ("matd3", "algorithm.critic", "own"),
         ("box", "algorithm.smoothing", False),
         ("box", "hyper.target_noise_clip", 9.0),
-        ("matd3", "hyper.logit_regulariser", 0.0),
+        ("matd3", "hyper.logit_regularizer", 0.0),
         ("matd3", "sequential", True),
         ("matd3-shared-sequential", "sequential", False),
         ("interleaved", "sequential", False),
@@ -248,7 +248,7 @@ def test_others_actions_are_constants():
 
 
 def test_nothing_moves_when_still():
-    """An update between two policy updates leaves actor, its optimiser and all targets as they are, bit for bit."""
+    """An update between two policy updates leaves actor, its optimizer and all targets as they are, bit for bit."""
     p, state, _, new, metrics = base("matd3-still")
     for before, after in zip(p.agents(state), p.agents(new), strict=True):
         assert not differing(before, after, names=("actor", "actor_target", "critic_targets", "actor_adam"))
@@ -278,7 +278,7 @@ def test_twin_critics_see_the_same_action():
     state, rows = p.inputs()
 
     def alike(s):
-        critics = {name: getattr(s, name) for name in ("critic", "critic_target", "critic_optimiser")}
+        critics = {name: getattr(s, name) for name in ("critic", "critic_target", "critic_optimizer")}
         same = jax.tree.map(lambda leaf: np.repeat(leaf[:, :1], 2, 1) if leaf.ndim > 1 else leaf, critics)
         return s._replace(**same)
 

@@ -49,7 +49,7 @@ TASKS = [
 
 
 class Draws:
-    """Stands in for mpe2's generator at reset, so that mpe2 itself colours and assigns the goal and key we want."""
+    """Stands in for mpe2's generator at reset, so that mpe2 itself colors and assigns the goal and key we want."""
 
     def __init__(self, integers):
         self._integers = iter(integers)

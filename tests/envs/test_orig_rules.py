@@ -86,9 +86,9 @@ def simple(bodies, pos, vel, comm, landmark, goal):
 
 
 def simple_reference(bodies, pos, vel, comm, landmark, goal):
-    """Each agent sees the colour of where the other one should go. All get the sum of both rewards."""
-    colour = 0.25 + 0.5 * np.eye(3)
-    seen = [np.concatenate([vel[i], *(landmark - pos[i]), colour[goal[i]], comm[1 - i]]) for i in (0, 1)]
+    """Each agent sees the color of where the other one should go. All get the sum of both rewards."""
+    color = 0.25 + 0.5 * np.eye(3)
+    seen = [np.concatenate([vel[i], *(landmark - pos[i]), color[goal[i]], comm[1 - i]]) for i in (0, 1)]
     total = -sum(distance(pos[1 - i], landmark[goal[i]]) ** 2 for i in (0, 1))
     return seen, [total, total]
 

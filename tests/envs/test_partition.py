@@ -93,7 +93,7 @@ def test_the_paper_s_observation_of_the_ant(split, recorded):
 
 
 def test_halves_are_the_left_and_the_right_of_the_walking_direction():
-    """+x is forward, so left is y > 0; and each half is drawn in one colour, thighs that are welded on included."""
+    """+x is forward, so left is y > 0; and each half is drawn in one color, thighs that are welded on included."""
     result = split_ant("halves")
     legs = RECORDED["legs"]
     for agent, numbers, side in ((0, "12", "+y"), (1, "34", "-y")):

@@ -28,7 +28,7 @@ def by_numpy(run, seed, team, observation):
         seen = [np.concatenate(seen)]
     actions = []
     for agent, x in zip(agents, seen, strict=True):
-        if settings.normalise_observations:
+        if settings.normalize_observations:
             start = sum(layout.observation_sizes[:agent])
             mean, variance = (np.float64(leaf)[seed, start : start + len(x)] for leaf in run.state.statistics)
             x = np.clip((x - mean) / np.sqrt(variance + 1e-8), -10, 10)
@@ -83,7 +83,7 @@ class Twin(Ledger):
 
 
 TWIN = Twin(teams=("agents", "adversaries", "agents"))
-TWIN_SETTINGS = [*SMALL[2:], "seeds=2", "normalise_observations=true"]
+TWIN_SETTINGS = [*SMALL[2:], "seeds=2", "normalize_observations=true"]
 
 
 def test_a_group_across_teams():

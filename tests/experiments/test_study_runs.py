@@ -40,7 +40,7 @@ def test_competitive_from_run_directories(tmp_path):
     assert claims["Predator-Prey"].difference.estimate == pytest.approx(6)
     table = tidy.read(out / "data.csv")
     assert {(row.where(env="simple_tag").values("algo")[0]) for row in [table]} == {"maddpg"}
-    scaled = competitive.normalised(table, "simple_tag")
+    scaled = competitive.normalized(table, "simple_tag")
     # Worst trial 3, best 11; the team is MATD3 in the first two pairings whatever the prey is.
     np.testing.assert_allclose(scaled["matd3", "maddpg"], (10 + NOISE - 3) / 8)
     np.testing.assert_allclose(scaled["maddpg", "matd3"], (4 + NOISE - 3) / 8)

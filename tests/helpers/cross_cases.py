@@ -18,10 +18,10 @@ SMALL = [
     "learning_starts=20", "replay_capacity=100", "total_steps=100", "algo.hidden=[5]",
 ]  # fmt: skip
 RUNS = {
-    # Networks of two sizes; observations normalised; agents joined into one, the adversary by itself; nothing special.
+    # Networks of two sizes; observations normalized; agents joined into one, the adversary by itself; nothing special.
     "mixed": ["algo=matd3", "adversary=maddpg", "adversary.hidden=[4,4]", "seeds=3"],
-    "normal": ["algo=iltd3", "normalise_observations=true", "seeds=2", "seed=7"],
-    "joint": ["algo=td3", "adversary=iddpg", "normalise_observations=true", "seeds=3"],
+    "normal": ["algo=iltd3", "normalize_observations=true", "seeds=2", "seed=7"],
+    "joint": ["algo=td3", "adversary=iddpg", "normalize_observations=true", "seeds=3"],
     "plain": ["algo=maddpg", "seeds=3", "seed=4"],
 }
 

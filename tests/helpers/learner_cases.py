@@ -68,7 +68,7 @@ class Case:
                 tau=0.2 + 0.1 * g,  # large, so that the order of agents shows
                 target_noise=0.9 + 0.1 * g,  # often clipped, and often out of a Box
                 target_noise_clip=0.95 - 0.05 * g,
-                logit_regulariser=0.02 * (1 + g),
+                logit_regularizer=0.02 * (1 + g),
                 max_grad_norm=0.15 + 0.05 * g,  # some variables are clipped and some are not
             )
             for g, h in enumerate(base)
@@ -81,7 +81,7 @@ def load(algo, adversary):
 
 
 def interleaved(algorithm) -> JointLayout:
-    """Agents of two kinds in the order A, B, A, C, B: groups that are no neighbours."""
+    """Agents of two kinds in the order A, B, A, C, B: groups that are no neighbors."""
     one, two = Simplex((3,)), Box(2, -1.0, 3.0)
     return JointLayout(
         agents=("a0", "b0", "a1", "c0", "b1"),
@@ -210,8 +210,8 @@ def agents_of(layout, state, hyper):
                 actor_target=layers(s.actor_target, k),
                 critics=[layers(s.critic, k, c) for c in critics],
                 critic_targets=[layers(s.critic_target, k, c) for c in critics],
-                actor_adam=adam(s.actor_optimiser, k),
-                critic_adams=[adam(s.critic_optimiser, k, c) for c in critics],
+                actor_adam=adam(s.actor_optimizer, k),
+                critic_adams=[adam(s.critic_optimizer, k, c) for c in critics],
                 average=None if s.actor_average is None else layers(s.actor_average, k),
             )
     return [agents[i] for i in range(layout.num_agents)]

@@ -22,7 +22,7 @@ HYPER = HyperParams(
     target_noise=0.2,
     target_noise_clip=0.5,
     exploration_noise=0.1,
-    logit_regulariser=1e-3,
+    logit_regularizer=1e-3,
     max_grad_norm=0.5,
 )
 

@@ -11,8 +11,8 @@ def random_states(env, rng):
     """Spread over the plane (reaching beyond the unit square), crowded, and piled up; some faster than any limit."""
     n, num_landmarks = len(env.agents), len(env.world.landmark_radius)
     scale = rng.choice([1.5, 0.4, 0.1], (NUM_STATES, 1, 1))
-    centre = rng.uniform(-1, 1, (NUM_STATES, 1, 2))
-    place = centre + scale * rng.uniform(-1, 1, (NUM_STATES, n + num_landmarks, 2))
+    center = rng.uniform(-1, 1, (NUM_STATES, 1, 2))
+    place = center + scale * rng.uniform(-1, 1, (NUM_STATES, n + num_landmarks, 2))
     movable = np.array(env.world.movable)
     comm = None
     if env.dim_c:

@@ -89,7 +89,7 @@ def smooth(space, action, normal, sigma, bound):
     return action + epsilon
 
 
-# ---- optimiser -------------------------------------------------------------------------------------------------------
+# ---- optimizer -------------------------------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass
@@ -223,7 +223,7 @@ def update(agents, batches, gumbel, normal, move, sequential):
         values = [forward(target, read)[0][:, 0] for target in agent.critic_targets]
         y = algorithm.reward_scale * r[i] + h.gamma * discount * np.min(values, axis=0)
 
-        # Critics: mean squared error, each with its own optimiser.
+        # Critics: mean squared error, each with its own optimizer.
         read = np.concatenate([*x, *a] if central else [x[i], a[i]], axis=1)
         losses = []
         for c in range(algorithm.num_critics):
@@ -247,11 +247,11 @@ def update(agents, batches, gumbel, normal, move, sequential):
         own, kept_act = act(agent.space, output, gumbel(agent.space.size), algorithm.actor_output)
         mixed = [own if j == i else a[j] for j in range(len(agents))]
         q, kept_q = forward(agent.critics[0], np.concatenate([*x, *mixed] if central else [x[i], own], axis=1))
-        metrics[2, i] = -q.mean() + h.logit_regulariser * (output**2).mean()
+        metrics[2, i] = -q.mean() + h.logit_regularizer * (output**2).mean()
         _, slope = backward(agent.critics[0], kept_q, np.full((batch, 1), -1 / batch))
         start = sum(o.shape[1] for o in x) + sum(o.shape[1] for o in a[:i]) if central else x[i].shape[1]
         slope = act_slope(agent.space, kept_act, slope[:, start : start + agent.space.size])
-        slope = slope + h.logit_regulariser * 2 * output / output.size
+        slope = slope + h.logit_regularizer * 2 * output / output.size
         gradients, _ = backward(agent.actor, kept, slope)
         gradients, count = clip(gradients, algorithm.clip, h.max_grad_norm)
         clipped += count

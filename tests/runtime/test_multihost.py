@@ -39,7 +39,7 @@ SEVEN = [*TINY, "seeds=7", "checkpoint_every=0"]
 
 @pytest.fixture(scope="module", autouse=True)
 def quick(quick_jit):
-    """Every program of this module, those of its processes too, compiles with little optimisation."""
+    """Every program of this module, those of its processes too, compiles with little optimization."""
 
 
 # ---- who the processes are -------------------------------------------------------------------------------------------
@@ -136,7 +136,7 @@ def test_tasks_of_a_node_share_its_gpus_out(more, gpus):
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 7])
-def test_shares_are_neighbours_and_nearly_equal(size):
+def test_shares_are_neighbors_and_nearly_equal(size):
     for seeds in range(size, 20):
         shares = [Processes(index, size).share(seeds).seeds for index in range(size)]
         whole = [seed for share in shares for seed in range(seeds)[share]]
@@ -318,7 +318,7 @@ def test_two_processes_make_the_run_of_one(alone, tmp_path, quickly_compiled):
     ours, theirs = (json.loads((path / "summary.json").read_text()) for path in (run, alone))
     assert ours.keys() == theirs.keys() and ours["last_tenth"].keys() == {"agents"}
     states = [leaves(path) for path in (run, alone)]
-    assert any("optimiser" in name for name in states[0])
+    assert any("optimizer" in name for name in states[0])
     same_numbers(*states, rtol=1e-4)
 
 

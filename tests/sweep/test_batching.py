@@ -24,7 +24,7 @@ def load(*more: str) -> config.Config:
 
 @pytest.mark.parametrize(
     "override",
-    ["algo.lr=0.1", "algo.actor_lr=0.1", "algo.gamma=0.9", "algo.tau=0.5", "algo.logit_regulariser=0",
+    ["algo.lr=0.1", "algo.actor_lr=0.1", "algo.gamma=0.9", "algo.tau=0.5", "algo.logit_regularizer=0",
      "algo.max_grad_norm=1", "algo.exploration_noise=0.3", "algo.target_noise_clip=0.1", "seed=5", "seeds=7", "name=x",
      "out=elsewhere"],
 )  # fmt: skip
@@ -103,7 +103,7 @@ def test_packing_takes_no_more_pieces_than_needed():
     "more",
     [
         ["seeds=6", "env=simple_spread", "algo.hidden=[64,64]", "batch_size=256"],
-        ["seeds=2", "n_step=3", "diagnostics.q_bias=true", "normalise_observations=true"],
+        ["seeds=2", "n_step=3", "diagnostics.q_bias=true", "normalize_observations=true"],
     ],
 )
 def test_the_computed_memory_covers_the_compiled_program(quickly_compiled, monkeypatch, more):

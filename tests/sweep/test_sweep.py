@@ -30,7 +30,7 @@ SWEPT = ["algo.lr=0.01,0.1", "algo.tau=0.01,0.5"]
 
 @pytest.fixture(scope="module", autouse=True)
 def quick(quick_jit):
-    """Every program of this module compiles with little optimisation."""
+    """Every program of this module compiles with little optimization."""
 
 
 def leaves(run: Path) -> dict[str, np.ndarray]:
@@ -55,7 +55,7 @@ def test_one_piece_holds_what_shares_a_program(swept):
 
 
 def test_each_member_equals_the_same_run_made_alone(swept, tmp_path):
-    """Metrics, networks, optimisers, environments and keys of one member, against a run of its settings."""
+    """Metrics, networks, optimizers, environments and keys of one member, against a run of its settings."""
     assert train.main([*TINY, "algo.lr=0.1", "algo.tau=0.01", "seeds=2", f"out={tmp_path}", "name=alone"]) == 0
     member = swept / "runs" / "lr_0.1-tau_0.01"
     found, alone = (RunDirectory(path).read_metrics() for path in (member, tmp_path / "alone"))

@@ -151,8 +151,8 @@ def test_counts_of_the_real_learner():
         written = (state.replay != 0).any(axis=-1).sum(axis=1)
         assert (written == min(24 + 24 * iterations, 60)).all()
         for group, delay in zip(state.groups, (2, 1), strict=True):
-            assert (group.critic_optimiser.count == 2 * iterations).all()
-            assert (group.actor_optimiser.count == 2 * iterations // delay).all()
+            assert (group.critic_optimizer.count == 2 * iterations).all()
+            assert (group.actor_optimizer.count == 2 * iterations // delay).all()
             for online, target in ((group.actor, group.actor_target), (group.critic, group.critic_target)):
                 # float32: 1 * online + 0 * target, perhaps written target + 1 * (online - target).
                 jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-7), online, target)

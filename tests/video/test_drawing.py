@@ -1,4 +1,4 @@
-"""Drawings in the plane: what is seen where, in which colour and how large, and that nothing leaves the picture."""
+"""Drawings in the plane: what is seen where, in which color and how large, and that nothing leaves the picture."""
 
 import jax
 import jax.numpy as jnp
@@ -28,27 +28,27 @@ def draw(env, states):
     return [np.asarray(image) for image in particle.scene(env, states).images(SIDE)]
 
 
-def at(place, half=1.08, centre=(0.0, 0.0)):
-    """(row, column) of a place in the world, where the view is a square about `centre`."""
-    x, y = (np.asarray(place) - centre) / (2 * half)
+def at(place, half=1.08, center=(0.0, 0.0)):
+    """(row, column) of a place in the world, where the view is a square about `center`."""
+    x, y = (np.asarray(place) - center) / (2 * half)
     return int((0.5 - y) * SIDE), int((0.5 + x) * SIDE)
 
 
-def close(pixels, colour, tolerance=60):
-    """Where pixels [..., 3] show a colour, an agent's transparency allowed for."""
-    return np.abs(np.asarray(pixels, int) - colour).max(axis=-1) < tolerance
+def close(pixels, color, tolerance=60):
+    """Where pixels [..., 3] show a color, an agent's transparency allowed for."""
+    return np.abs(np.asarray(pixels, int) - color).max(axis=-1) < tolerance
 
 
 TAG = [[-0.6, 0.5], [0.6, 0.5], [0.0, -0.4], [0.2, 0.8]]
 
 
-def test_everything_is_where_it_is_and_in_its_colour():
+def test_everything_is_where_it_is_and_in_its_color():
     """Three predators and a prey, y upwards; obstacles dark."""
     image = draw(make("simple_tag"), still(make("simple_tag"), pos=TAG, landmark=[[-0.5, -0.6], [0.6, -0.5]]))[0]
     assert image.shape == (SIDE, SIDE, 3) and image.dtype == np.uint8
-    for place, colour in zip(TAG, [VERMILION] * 3 + [BLUE], strict=True):
+    for place, color in zip(TAG, [VERMILION] * 3 + [BLUE], strict=True):
         row, column = at(np.array(place) + [0, 0.035])  # above the number that stands in its middle
-        assert close(image[row, column], colour), (place, image[row, column])
+        assert close(image[row, column], color), (place, image[row, column])
     for place in ([-0.5, -0.6], [0.6, -0.5]):
         assert close(image[at(place)], DARK_GREY, 5)
     assert close(image[at([0.5, 0.0])], (255, 255, 255), 25)
@@ -72,12 +72,12 @@ def test_the_view_stays_and_holds_what_runs_away():
     path = jnp.array([[0.0, 0.0], [3.0, -1.0], [7.0, -3.0]])
     states = states._replace(pos=states.pos.at[:, 0].set(path).at[:, 1:].set(jnp.array([[0.9, 0.9], [-0.9, 0.9]])))
     images = draw(env, states)
-    half, centre = 1.08 * 8.15 / 2, (3.075, -1.075)  # from -1 to 7.15, and from -3.15 to 1
+    half, center = 1.08 * 8.15 / 2, (3.075, -1.075)  # from -1 to 7.15, and from -3.15 to 1
     for image, place in zip(images, path, strict=True):
-        assert close(image[at(place, half, centre)], BLUE)
+        assert close(image[at(place, half, center)], BLUE)
         for landmark in ([0.5, 0.5], [-0.5, 0.5], [0, -0.5]):
-            assert close(image[at(landmark, half, centre)], GREY)
-    assert not close(images[2][at(path[0], half, centre)], BLUE)
+            assert close(image[at(landmark, half, center)], GREY)
+    assert not close(images[2][at(path[0], half, center)], BLUE)
 
 
 def test_nothing_shrinks_out_of_sight():
@@ -99,14 +99,14 @@ def test_the_goal_is_green(name):
     env = make(name)
     states = still(env, goal=1)
     image = draw(env, states._replace(pos=states.pos * 0 + 0.9))[0]
-    half, centre = plane_of(env, states._replace(pos=states.pos * 0 + 0.9))
+    half, center = plane_of(env, states._replace(pos=states.pos * 0 + 0.9))
     for i, place in enumerate(np.asarray(states.landmark[0])):
-        assert close(image[at(place, half, centre)], GREEN if i == 1 else GREY, 25)
+        assert close(image[at(place, half, center)], GREEN if i == 1 else GREY, 25)
 
 
 def plane_of(env, states):
-    centre, half = particle.scene(env, states).view()
-    return half, centre
+    center, half = particle.scene(env, states).view()
+    return half, center
 
 
 def messages(env, comm, **changes):
@@ -135,8 +135,8 @@ def test_a_walking_speaker_takes_its_message_along():
     pos[:, 0] = [[-0.5, 0.3], [0.5, 0.3]]
     for place, image in zip(pos[:, 0], draw(env, states._replace(pos=jnp.asarray(pos))), strict=True):
         rows, columns = np.nonzero(close(image, PURPLE, 10))
-        half, centre = plane_of(env, states._replace(pos=jnp.asarray(pos)))
-        row, column = at(place, half, centre)
+        half, center = plane_of(env, states._replace(pos=jnp.asarray(pos)))
+        row, column = at(place, half, center)
         assert rows.max() < row and columns.mean() == pytest.approx(column, abs=2)
         assert columns.max() - columns.min() == pytest.approx(4 * 0.03 * SIDE, abs=4)
 
@@ -155,7 +155,7 @@ def test_goals_bear_the_numbers_of_those_that_should_go_there(goal, labels):
     discs = particle.scene(env, still(env, goal=goal)).discs[:3]
     assert [disc.label for disc in discs] == labels
     assert [disc.ringed for disc in discs] == [bool(label) for label in labels]
-    assert [disc.colour for disc in discs] == [GREEN if label else GREY for label in labels]
+    assert [disc.color for disc in discs] == [GREEN if label else GREY for label in labels]
 
 
 def test_food_in_a_forest_is_seen_and_so_is_who_hides_there():
@@ -164,12 +164,12 @@ def test_food_in_a_forest_is_seen_and_so_is_who_hides_there():
     landmark = [[-0.6, -0.6], [0.5, 0.6], [0.6, -0.6], [0.5, 0.5], [-0.5, 0.6]]
     pos = [[-0.9, 0.0], [-0.3, 0.0], [0.0, 0.0], [0.3, 0.0], [0.5, 0.4], [0.9, 0.0]]
     image = draw(env, still(env, landmark=landmark, pos=pos))[0]
-    half, centre = plane_of(env, still(env, landmark=landmark, pos=pos))
-    for place, colour in (
+    half, center = plane_of(env, still(env, landmark=landmark, pos=pos))
+    for place, color in (
         ([-0.6, -0.6], DARK_GREY), ([0.5, 0.6], YELLOW), ([0.6, -0.6], YELLOW), ([0.3, 0.5], PALE_GREEN),
         ([-0.5, 0.6], PALE_GREEN), ([0.47, 0.4], BLUE),
     ):  # fmt: skip
-        assert close(image[at(place, half, centre)], colour, 45), place
+        assert close(image[at(place, half, center)], color, 45), place
 
 
 def test_silent_agents_show_no_message():
@@ -200,7 +200,7 @@ def test_message_and_label_stay_in_sight(corner):
 
 @pytest.mark.parametrize("name", TASKS)
 def test_every_task_is_drawn_and_explained(name):
-    """As many pictures as states, all different where all move; every colour of the legend is seen."""
+    """As many pictures as states, all different where all move; every color of the legend is seen."""
     env = make(name)
     keys = jax.random.split(jax.random.key(1), 4)
     state, _ = env.reset(keys[0])
@@ -213,8 +213,8 @@ def test_every_task_is_drawn_and_explained(name):
     assert all(np.any(a != b) for a, b in zip(images, images[1:], strict=False))
     legend = particle.legend(env)
     assert [what for what, _ in legend][: len(set(env.teams))]
-    for what, colour in legend:
-        assert close(images[-1], colour).any(), what
+    for what, color in legend:
+        assert close(images[-1], color).any(), what
 
 
 def point(env, pos, target):

@@ -1,4 +1,4 @@
-"""Robots through MuJoCo's renderer: who has which colour, what the camera follows, and what is said without OpenGL."""
+"""Robots through MuJoCo's renderer: who has which color, what the camera follows, and what is said without OpenGL."""
 
 import os
 import subprocess
@@ -62,21 +62,21 @@ def draw(env, qpos) -> list[np.ndarray]:
     return [np.asarray(image, int) for image in drawing.images(np.asarray(qpos, np.float64), 300, 200)]
 
 
-def hue(pixels, colour):
-    """Where pixels [..., 3] are a shade of a colour, as lit surfaces are."""
+def hue(pixels, color):
+    """Where pixels [..., 3] are a shade of a color, as lit surfaces are."""
     pixels = np.asarray(pixels, float)
     size = np.linalg.norm(pixels, axis=-1).clip(1)
-    same = pixels @ (np.array(colour) / np.linalg.norm(colour)) / size > 0.985
+    same = pixels @ (np.array(color) / np.linalg.norm(color)) / size > 0.985
     return same & (size > 60)
 
 
-def test_each_agent_has_its_colour_and_the_torso_none(gl):
+def test_each_agent_has_its_color_and_the_torso_none(gl):
     """Seen from the side, x to the right: the left arm blue, the right one vermilion, grey in between."""
     env = robot(**PLANAR)
     before = env.mj_model.geom_rgba.copy()
     (image,) = draw(env, [env.mj_model.qpos0])
     assert image.shape == (200, 300, 3)
-    blue, vermilion = (np.argwhere(hue(image, colour)) for colour in (BLUE, VERMILION))
+    blue, vermilion = (np.argwhere(hue(image, color)) for color in (BLUE, VERMILION))
     assert len(blue) > 300 and len(vermilion) > 300
     assert blue[:, 1].max() < 150 < vermilion[:, 1].min()
     torso = image[int(blue[:, 0].mean()), 150]
@@ -88,8 +88,8 @@ def test_the_floor_is_a_quiet_checkerboard_under_a_white_sky(gl):
     (image,) = draw(robot(**PLANAR), [np.zeros(5)])
     assert image[2, 150].min() > 250
     dark, bright = mujoco_renderer.FLOOR
-    for colour in (dark, bright):
-        assert np.sum(np.abs(image[120:] - colour).max(axis=-1) < 20) > 1000
+    for color in (dark, bright):
+        assert np.sum(np.abs(image[120:] - color).max(axis=-1) < 20) > 1000
 
 
 def test_the_camera_follows_and_the_floor_shows_it(gl):
@@ -98,9 +98,9 @@ def test_the_camera_follows_and_the_floor_shows_it(gl):
     path = np.tile(env.mj_model.qpos0, (60, 1))
     path[:, 0] = np.linspace(0, 20.3, 60)
     images = draw(env, path)
-    centres = [np.argwhere(hue(image, BLUE) | hue(image, VERMILION)).mean(axis=0) for image in images[::15]]
-    for centre in centres:
-        np.testing.assert_allclose(centre, centres[0], atol=4)
+    centers = [np.argwhere(hue(image, BLUE) | hue(image, VERMILION)).mean(axis=0) for image in images[::15]]
+    for center in centers:
+        np.testing.assert_allclose(center, centers[0], atol=4)
     assert np.mean(np.abs(images[20] - images[21]).max(axis=-1) > 15) > 0.02
 
 
@@ -119,8 +119,8 @@ def test_pictures_come_with_caption_and_legend(gl):
     pixels = np.asarray(frame, int)
     assert frame.size == (320, 240)
     assert (pixels[:18].max(axis=-1) < 60).sum() > 40
-    for colour in (BLUE, VERMILION):
-        assert (np.abs(pixels[-18:] - colour).max(axis=-1) < 3).sum() > 20
+    for color in (BLUE, VERMILION):
+        assert (np.abs(pixels[-18:] - color).max(axis=-1) < 3).sum() > 20
 
 
 def test_drawing_works_whoever_imported_mujoco_first(gl):
@@ -167,7 +167,7 @@ def test_real_robots_show_every_agent(gl, name):
     env = make(name)
     (image,) = draw(env, [env.mj_model.qpos0])
     for agent in range(len(env.agents)):
-        assert hue(image, mujoco_renderer.agent_colour(agent)).sum() > 100, agent
+        assert hue(image, mujoco_renderer.agent_color(agent)).sum() > 100, agent
 
 
 def test_an_opengl_that_mujoco_does_not_know_is_one_line_of_the_command(tmp_path):

@@ -28,13 +28,20 @@ ADDED_LATER = {
     "eval_every": 0,
     "eval_episodes": 10,
     "n_step": 1,
-    "normalise_observations": False,
-    "normalise_least_deviation": 0.0,
+    "normalize_observations": False,
+    "normalize_least_deviation": 0.0,
     "diagnostics": {"q_bias": False, "q_bias_rollouts": 200, "q_bias_steps": 100},
     "algo": ADDED_TO_ALGO,
     "adversary": ADDED_TO_ALGO,
 }
 """Keys that runs from before them lack, with the values that those runs had in effect; a group may lack some, too."""
+
+RENAMED = {
+    "normalise_observations": "normalize_observations",
+    "normalise_least_deviation": "normalize_least_deviation",
+    "logit_regulariser": "logit_regularizer",
+}
+"""Keys that runs from before have under other names."""
 
 HYPER_PARAMS = tuple(name for name in HyperParams._fields if name != "exploration_noise_high")
 """Settings of an algorithm that may differ between runs of one program."""
@@ -69,7 +76,7 @@ class AlgoConfig:
     hidden: tuple[int, ...]
     clip: str
     max_grad_norm: float
-    logit_regulariser: float
+    logit_regularizer: float
     exploration_noise: float | tuple[float, float]
     sync_targets: bool
     adam: str
@@ -121,8 +128,8 @@ class Config:
     shared_minibatch: bool
     update_order: str
     n_step: int
-    normalise_observations: bool
-    normalise_least_deviation: float
+    normalize_observations: bool
+    normalize_least_deviation: float
     replay_capacity: int
     learning_starts: int
     warmup: str
@@ -273,7 +280,7 @@ def read(path: Path) -> Config:
     try:
         found = OmegaConf.to_container(OmegaConf.load(path))
         assert isinstance(found, dict)
-        values = _with_defaults(found, ADDED_LATER)
+        values = _with_defaults(renamed(found), ADDED_LATER)
         if "physics" in values["env"]:
             from matd3_jax.envs.robots.engines.engine import RENAMED
 
@@ -282,6 +289,13 @@ def read(path: Path) -> Config:
         return from_dict(values)
     except (OSError, AssertionError, ValueError, OmegaConfBaseException) as error:
         raise UserError(f"cannot read the configuration {path}: {_one_line(error)}") from error
+
+
+def renamed(values: Mapping[Any, Any]) -> dict[Any, Any]:
+    """Plain settings with the names that keys have now, in their groups, too."""
+    return {
+        RENAMED.get(key, key): renamed(value) if isinstance(value, Mapping) else value for key, value in values.items()
+    }
 
 
 def text(config: Config) -> str:
@@ -346,7 +360,9 @@ def _check_keys(tree: DictConfig, values: Sequence[Override]) -> None:
                 groups = ("algo", "env", "diagnostics")
                 elsewhere = [f"{group}.{name}" for group in groups if name in tree.get(group, {})]
                 elsewhere += [name] if depth and name in tree else []
+                now = RENAMED.get(name)
                 hint = f"did you mean {' or '.join(map(repr, elsewhere))}?" if elsewhere else nearest(name, keys)
+                hint = f"it is called {'.'.join([*path[:-1], now])!r} now" if now else hint
                 raise UserError(
                     f"there is no key {override.key_or_group!r}{f' (in {prefix})' if prefix else ''}; {hint}"
                 )

@@ -33,11 +33,11 @@ def check(config: "Config") -> None:
     for key in ("eval_every", "checkpoint_every"):
         value = getattr(config, key)
         need(value is None or value >= 0, f"{key}={value}: must not be negative")
-    least = config.normalise_least_deviation
-    need(0 <= least < math.inf, f"normalise_least_deviation={least}: must not be negative")
+    least = config.normalize_least_deviation
+    need(0 <= least < math.inf, f"normalize_least_deviation={least}: must not be negative")
     need(
-        not least or config.normalise_observations,
-        f"normalise_least_deviation={least} goes with normalise_observations=true",
+        not least or config.normalize_observations,
+        f"normalize_least_deviation={least} goes with normalize_observations=true",
     )
     diagnostics = config.diagnostics
     for key in ("q_bias_rollouts", "q_bias_steps"):
@@ -88,7 +88,7 @@ def _check_team(name: str, team: "AlgoConfig", updates: int, need: Any) -> None:
     for key in ("actor_lr", "critic_lr", "max_grad_norm"):
         value = getattr(team, key)
         need(0 < value < math.inf, f"{name}.{key}={value}: must be positive")
-    for key in ("target_noise", "target_noise_clip", "logit_regulariser"):
+    for key in ("target_noise", "target_noise_clip", "logit_regularizer"):
         value = getattr(team, key)
         need(0 <= value < math.inf, f"{name}.{key}={value}: must not be negative")
     noise = team.exploration_noise

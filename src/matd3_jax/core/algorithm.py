@@ -26,7 +26,7 @@ class Algorithm:
     adam: Literal["standard", "epsilon_hat"] = "standard"
     """"epsilon_hat": epsilon outside the bias correction, as TensorFlow 1 has it."""
     actor_output: Literal["sigmoid", "tanh"] = "sigmoid"
-    """How a Box action follows from an actor's output u: low + (high - low) sigmoid(u), or centre + half range tanh(u),
+    """How a Box action follows from an actor's output u: low + (high - low) sigmoid(u), or center + half range tanh(u),
     which is the sigmoid of 2u: twice the slope."""
     reward_scale: float = 1.0
     """Of the rewards that the critics learn from; reported returns and Q-bias stay in the environment's units."""
@@ -57,7 +57,7 @@ class HyperParams(NamedTuple):
     exploration_noise: chex.Array | float
     """Standard deviation of the noise added to Box actions while collecting, in units of the half range; with
     `Algorithm.noise_range` the lower end of the range."""
-    logit_regulariser: chex.Array | float
+    logit_regularizer: chex.Array | float
     """Weight of the mean squared actor output (logits, or the number before the squashing) in the actor loss."""
     max_grad_norm: chex.Array | float
     exploration_noise_high: chex.Array | float = 0.0

@@ -71,5 +71,5 @@ def actor_loss(
     output = apply(group.actor, params, batch.observation)
     action = group.policy.sample(output, noise.action)
     q = group.critic.value(critic, batch.inputs, action - batch.action, batch.action_column)
-    loss = -q.mean() + hyper.logit_regulariser * jnp.mean(jnp.square(output))
+    loss = -q.mean() + hyper.logit_regularizer * jnp.mean(jnp.square(output))
     return loss, loss

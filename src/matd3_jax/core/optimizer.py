@@ -54,7 +54,7 @@ def apply(
     max_norm: chex.Array,
     stack_ndim: int,
 ) -> tuple[chex.ArrayTree, optax.OptState]:
-    """One optimiser step: (params, state) after it."""
+    """One optimizer step: (params, state) after it."""
     gradients = clip(gradients, algorithm, stack_ndim, max_norm)
     direction, state = adam(algorithm.adam).update(gradients, state)
     return jax.tree.map(lambda p, d: p - lr * d, params, direction), state

@@ -87,7 +87,7 @@ def estimate(
     """Q_i(x, a) of every agent, mean over its critics, in the units of its rewards: [pairs, num_agents]."""
     x, action = jnp.split(inputs, [layout.observation_size], axis=-1)
     if policy.statistics is not None:
-        x = running_statistics.normalise(policy.statistics, x)
+        x = running_statistics.normalize(policy.statistics, x)
     values: list[Any] = [None] * layout.num_agents
     for group, params in zip(layout.groups, critics, strict=True):
         for k, i in enumerate(group.members):

@@ -26,7 +26,7 @@ class PolicyParams(NamedTuple):
     hyper: tuple[HyperParams, ...]
     """One per group."""
     statistics: Statistics | None
-    """What observations are normalised by; None: they are not."""
+    """What observations are normalized by; None: they are not."""
 
 
 class EnvState(NamedTuple):
@@ -215,7 +215,7 @@ def act(
     """
     parts, statistics = [], policy.statistics
     if statistics is not None:
-        observation = [running_statistics.normalise_part(layout, statistics, o, i) for i, o in enumerate(observation)]
+        observation = [running_statistics.normalize_part(layout, statistics, o, i) for i, o in enumerate(observation)]
     for g, group in enumerate(layout.groups):
         stacked = jnp.stack([observation[i] for i in group.members])
         output = networks.apply(group.actors, policy.actors[g], stacked)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from matd3_jax.core.agents import JointLayout
 
 CLIP = 10.0
-"""Bound of normalised entries: one that hardly ever moves must not flood a network when it does."""
+"""Bound of normalized entries: one that hardly ever moves must not flood a network when it does."""
 LEAST_VARIANCE = 1e-8
 """Added to variances, for entries that are constant."""
 
@@ -48,19 +48,19 @@ def floored(statistics: Statistics, deviation: float) -> Statistics:
     return statistics._replace(variance=jnp.maximum(statistics.variance, deviation**2))
 
 
-def normalise(statistics: Statistics, x: chex.Array) -> chex.Array:
+def normalize(statistics: Statistics, x: chex.Array) -> chex.Array:
     """(x - mean) / standard deviation, within +-10, of joint observations x [..., observation_size]."""
     scaled = (x - statistics.mean) / jnp.sqrt(statistics.variance + LEAST_VARIANCE)
     return jnp.clip(scaled, -CLIP, CLIP)
 
 
-def normalise_part(layout: JointLayout, statistics: Statistics, observation: chex.Array, agent: int) -> chex.Array:
+def normalize_part(layout: JointLayout, statistics: Statistics, observation: chex.Array, agent: int) -> chex.Array:
     """The same of one agent's observations o_i [..., observation_sizes[agent]]."""
-    return normalise(Statistics(*(layout.observation_part(part, agent) for part in statistics)), observation)
+    return normalize(Statistics(*(layout.observation_part(part, agent) for part in statistics)), observation)
 
 
-def normalise_rows(layout: JointLayout, statistics: Statistics, rows: chex.Array) -> chex.Array:
+def normalize_rows(layout: JointLayout, statistics: Statistics, rows: chex.Array) -> chex.Array:
     """The same of x and x' in replay rows [..., row_size]."""
     for columns in layout.observation_columns:
-        rows = rows.at[..., columns].set(normalise(statistics, rows[..., columns]))
+        rows = rows.at[..., columns].set(normalize(statistics, rows[..., columns]))
     return rows

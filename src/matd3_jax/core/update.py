@@ -19,14 +19,14 @@ UNROLLED_MEMBERS = 4
 
 
 class GroupState(NamedTuple):
-    """Networks and optimisers of one group. Leaves have leading axes [members], critics [members, critics]."""
+    """Networks and optimizers of one group. Leaves have leading axes [members], critics [members, critics]."""
 
     actor: chex.ArrayTree
     critic: chex.ArrayTree
     actor_target: chex.ArrayTree
     critic_target: chex.ArrayTree
-    actor_optimiser: optax.OptState
-    critic_optimiser: optax.OptState
+    actor_optimizer: optax.OptState
+    critic_optimizer: optax.OptState
     actor_average: chex.ArrayTree | None = None
     """With `Algorithm.actor_average` alone."""
 
@@ -49,7 +49,7 @@ def critic_input_size(layout: JointLayout, group: Group) -> int:
 
 
 def init(layout: JointLayout, key: chex.PRNGKey) -> tuple[GroupState, ...]:
-    """Fresh networks and optimisers of all groups."""
+    """Fresh networks and optimizers of all groups."""
 
     def one(group: Group, key: chex.PRNGKey) -> GroupState:
         algorithm, keys = group.algorithm, jax.random.split(key, 4)
@@ -183,10 +183,10 @@ def _update_agent(
 
     critic_gradient = jax.grad(lambda params: losses.critic_loss(group, params, batch, y), has_aux=True)
     gradients, (loss, q_value) = _mean_over(axis, critic_gradient(state.critic))
-    q_params, q_optimiser = optimizer.apply(
-        algorithm, state.critic, state.critic_optimiser, gradients, hyper.critic_lr, hyper.max_grad_norm, stack_ndim=1
+    q_params, q_optimizer = optimizer.apply(
+        algorithm, state.critic, state.critic_optimizer, gradients, hyper.critic_lr, hyper.max_grad_norm, stack_ndim=1
     )
-    state = state._replace(critic=q_params, critic_optimiser=q_optimiser)
+    state = state._replace(critic=q_params, critic_optimizer=q_optimizer)
     if not move:
         return state, (loss, q_value, jnp.full((), jnp.nan))
 
@@ -194,13 +194,13 @@ def _update_agent(
         lambda params: losses.actor_loss(group, hyper, params, q_params, batch, noise), has_aux=True
     )
     gradients, mu_loss = _mean_over(axis, actor_gradient(state.actor))
-    mu_params, mu_optimiser = optimizer.apply(
-        algorithm, state.actor, state.actor_optimiser, gradients, hyper.actor_lr, hyper.max_grad_norm, stack_ndim=0
+    mu_params, mu_optimizer = optimizer.apply(
+        algorithm, state.actor, state.actor_optimizer, gradients, hyper.actor_lr, hyper.max_grad_norm, stack_ndim=0
     )
     # theta' <- tau theta + (1 - tau) theta'
     state = state._replace(
         actor=mu_params,
-        actor_optimiser=mu_optimiser,
+        actor_optimizer=mu_optimizer,
         actor_target=optax.incremental_update(mu_params, state.actor_target, hyper.tau),
         critic_target=optax.incremental_update(q_params, state.critic_target, hyper.tau),
     )

@@ -18,8 +18,8 @@ def draw(path: Path, names: Sequence[str], pairings: Pairings, title: str) -> No
     """Write the picture: rows are the runs of the agents, columns those of the adversaries.
 
     In each cell stands the mean return with its interval; a run against itself is framed, and the pairs trained
-    together stand there apart. A cell's colour is the mean over the others, where there are others. The colours are
-    told apart by colour-blind eyes, and in grey.
+    together stand there apart. A cell's color is the mean over the others, where there are others. The colors are
+    told apart by color-blind eyes, and in grey.
     """
     n = len(names)
     longest = max(len(name) for name in names)
@@ -45,9 +45,9 @@ def draw(path: Path, names: Sequence[str], pairings: Pairings, title: str) -> No
             red, green, blue, _ = image.cmap(image.norm(values[i, j])) if np.isfinite(values[i, j]) else (1, 1, 1, 1)
             dark = 0.299 * red + 0.587 * green + 0.114 * blue < 0.5
             axis.text(j, i, label, ha="center", va="center", fontsize=8, color="white" if dark else "black")
-        for i, (colour, width) in itertools.product(range(n), (("white", 4.0), ("black", 1.8))):
+        for i, (color, width) in itertools.product(range(n), (("white", 4.0), ("black", 1.8))):
             corner = (i - 0.47, i - 0.47)
-            axis.add_patch(Rectangle(corner, 0.94, 0.94, fill=False, edgecolor=colour, linewidth=width))
+            axis.add_patch(Rectangle(corner, 0.94, 0.94, fill=False, edgecolor=color, linewidth=width))
         axis.set_xticks(range(n), names, rotation=30, ha="right", rotation_mode="anchor")
         axis.set_yticks(range(n), names)
         axis.set_xlabel("adversaries of")

@@ -15,11 +15,11 @@ from matd3_jax.errors import UserError
 from matd3_jax.runs.metrics import by_seed
 from matd3_jax.stats.intervals import Estimate, mean_interval
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Told apart by all kinds of colour vision: Okabe and Ito 2008, without the yellow, which is faint on white."""
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Told apart by all kinds of color vision: Okabe and Ito 2008, without the yellow, which is faint on white."""
 
 STYLES = ("solid", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5)), (0, (8, 2)))
-"""As many as stand apart; 5 and the 7 colours have no common factor, so 35 lines differ in one or the other."""
+"""As many as stand apart; 5 and the 7 colors have no common factor, so 35 lines differ in one or the other."""
 
 FORMATS = (".png", ".pdf", ".svg")
 
@@ -64,7 +64,7 @@ def check(path: Path) -> Path:
 def compare(
     path: Path, panels: Sequence[Panel], x_label: str, title: str = "", caption: str = "", each: bool = False
 ) -> None:
-    """Draw lines with bands, side by side in panels, in colours and dashes that can be told apart.
+    """Draw lines with bands, side by side in panels, in colors and dashes that can be told apart.
 
     The legend stands beside the panels where there are many lines or panels, or else in a free corner.
 
@@ -81,7 +81,7 @@ def compare(
         axes = figure.subplots(rows, columns, squeeze=False, sharex=True).ravel()
         for k, (axis, panel) in enumerate(zip(axes, panels, strict=False)):
             for i, line in enumerate(panel.lines):
-                _draw(axis, line, COLOURS[i % len(COLOURS)], STYLES[i % len(STYLES)], each)
+                _draw(axis, line, COLORS[i % len(COLORS)], STYLES[i % len(STYLES)], each)
             _dress(axis)
             axis.set_ylabel(panel.y_label)
             axis.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -107,13 +107,13 @@ def compare(
             raise UserError(f"cannot write {path}: {error.strerror}") from error
 
 
-def _draw(axis, line: Line, colour: str, style, each: bool) -> None:
+def _draw(axis, line: Line, color: str, style, each: bool) -> None:
     middle, low, high = line.estimate
     dot = {"marker": "o", "markersize": 3} if len(line.x) == 1 else {}  # or nothing would be seen
     if each and len(line.seeds) > 1:
-        axis.plot(line.x, line.seeds.T, color=colour, linewidth=0.5, alpha=0.35, **dot)
-    axis.fill_between(line.x, low, high, color=colour, alpha=0.2, linewidth=0)
-    axis.plot(line.x, middle, color=colour, linestyle=style, linewidth=1.4, label=line.label, **dot)
+        axis.plot(line.x, line.seeds.T, color=color, linewidth=0.5, alpha=0.35, **dot)
+    axis.fill_between(line.x, low, high, color=color, alpha=0.2, linewidth=0)
+    axis.plot(line.x, middle, color=color, linestyle=style, linewidth=1.4, label=line.label, **dot)
 
 
 def _dress(axis) -> None:
@@ -134,10 +134,10 @@ def learning_curve(path: Path, metrics: Mapping[str, np.ndarray], title: str) ->
     axes = np.atleast_1d(np.asarray(figure.subplots(len(teams), sharex=True), dtype=object))
     seeds = np.unique(metrics["seed"])
     who = f"mean of {len(seeds)} seeds, 95 % interval" if len(seeds) > 1 else "one seed"
-    for axis, team, colour in zip(axes, teams, ("tab:blue", "tab:red"), strict=False):
+    for axis, team, color in zip(axes, teams, ("tab:blue", "tab:red"), strict=False):
         evaluated = f"eval_{team}" in metrics
-        kinds = [(team, "training (exploring)", "tab:gray" if evaluated else colour)]
-        kinds += [(f"eval_{team}", "evaluation (deterministic)", colour)] if evaluated else []
+        kinds = [(team, "training (exploring)", "tab:gray" if evaluated else color)]
+        kinds += [(f"eval_{team}", "evaluation (deterministic)", color)] if evaluated else []
         for name, kind, shade in kinds:
             steps, curves = by_seed(metrics, name)
             curve(axis, steps, curves, shade, f"{kind}, {who}", each=True)
@@ -148,12 +148,12 @@ def learning_curve(path: Path, metrics: Mapping[str, np.ndarray], title: str) ->
     figure.savefig(path, dpi=120)
 
 
-def curve(axis, steps: np.ndarray, curves: np.ndarray, colour: str, label: str, each: bool = False) -> None:
+def curve(axis, steps: np.ndarray, curves: np.ndarray, color: str, label: str, each: bool = False) -> None:
     """One line: the mean of curves [seeds, points] with the 95 % interval of the mean; `each`: every seed too, thin."""
     mean, half = mean_interval(curves)
     if each and len(curves) > 1:
-        axis.plot(steps, curves.T, color=colour, linewidth=0.5, alpha=0.35)
+        axis.plot(steps, curves.T, color=color, linewidth=0.5, alpha=0.35)
     if len(curves) > 1:
-        axis.fill_between(steps, mean - half, mean + half, color=colour, alpha=0.25, linewidth=0)
-    axis.plot(steps, mean, color=colour, label=label if len(curves) > 1 else "one seed")
+        axis.fill_between(steps, mean - half, mean + half, color=color, alpha=0.25, linewidth=0)
+    axis.plot(steps, mean, color=color, label=label if len(curves) > 1 else "one seed")
     _dress(axis)

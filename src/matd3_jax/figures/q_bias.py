@@ -8,7 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from matd3_jax.figures.learning_curves import curve
-from matd3_jax.figures.palette import AGENT, BLACK, Colour
+from matd3_jax.figures.palette import AGENT, BLACK, Color
 from matd3_jax.runs.metrics import by_seed
 from matd3_jax.runs.overestimation import team_values
 
@@ -33,8 +33,8 @@ def draw(path: Path, metrics: Mapping[str, np.ndarray], teams: Mapping[str, Sequ
         _line(values, steps, truth, AGENT[1], "true value of the policies", dashed=True)
         for k, agent in enumerate(agents if len(agents) > 1 else ()):
             each = by_seed(metrics, f"{agent}_overestimation")[1].mean(axis=0)
-            colour = _hex(AGENT[(k + 2) % len(AGENT)])
-            bias.plot(steps, each, color=colour, linewidth=1, label=agent, zorder=3)
+            color = _hex(AGENT[(k + 2) % len(AGENT)])
+            bias.plot(steps, each, color=color, linewidth=1, label=agent, zorder=3)
         _line(bias, steps, over, BLACK, f"mean of the {len(agents)} agents" if len(agents) > 1 else agents[0])
         bias.axhline(0, color="gray", linewidth=0.8)
         values.set_title(team if len(teams) > 1 else "")
@@ -47,13 +47,13 @@ def draw(path: Path, metrics: Mapping[str, np.ndarray], teams: Mapping[str, Sequ
     figure.savefig(path, dpi=120)
 
 
-def _line(axis, steps: np.ndarray, curves: np.ndarray, colour: Colour, label: str, dashed: bool = False) -> None:
-    curve(axis, steps, curves, _hex(colour), label)
+def _line(axis, steps: np.ndarray, curves: np.ndarray, color: Color, label: str, dashed: bool = False) -> None:
+    curve(axis, steps, curves, _hex(color), label)
     line = axis.lines[-1]
     line.set(label=label, linewidth=1.8, linestyle="--" if dashed else "-")
     if len(steps) == 1:
         line.set_marker("o")
 
 
-def _hex(colour: Colour) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*colour)
+def _hex(color: Color) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*color)

@@ -13,11 +13,11 @@ from matd3_jax.stats.intervals import mean_interval
 from matd3_jax.sweep.ranking import Ranked
 
 BEST = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
-"""Okabe and Ito's, told apart by the colour-blind; for the best settings, in order."""
+"""Okabe and Ito's, told apart by the color-blind; for the best settings, in order."""
 
 
 def draw(path: Path, folder: Path, runs: Mapping[str, Sequence[str]], rows: Sequence[Ranked], metric: str) -> None:
-    """Curves of all settings (the best five in colour) and, for each swept key, the final value of every setting.
+    """Curves of all settings (the best five in color) and, for each swept key, the final value of every setting.
 
     Args:
         folder: where the run directories are; runs: their names by setting.

@@ -113,7 +113,7 @@ def on_one_grid(series: Sequence[Series], at_points: bool) -> tuple[np.ndarray, 
 
 
 def _means(one: Series, edges: np.ndarray) -> np.ndarray:
-    """Means of a series between neighbouring edges."""
+    """Means of a series between neighboring edges."""
     knots = np.concatenate([[min(one.start, one.x[0])], one.x])
     sums = np.concatenate([[0], np.cumsum(one.y * np.diff(knots))])
     low, high = np.maximum(edges[:-1], knots[0]), edges[1:]

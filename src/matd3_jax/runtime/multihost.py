@@ -60,7 +60,7 @@ class Processes:
         self._told: list[str] = []
 
     def share(self, seeds: int) -> Share:
-        """This process's part of `seeds`: neighbours, shares differ by one at most. Raises UserError where some process
+        """This process's part of `seeds`: neighbors, shares differ by one at most. Raises UserError where some process
         would have none."""
         if seeds < self.size:
             raise UserError(

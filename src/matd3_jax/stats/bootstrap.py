@@ -81,7 +81,7 @@ def aggregate(
 ) -> Estimate:
     """One number for the scores of all tasks with its stratified bootstrap interval (Agarwal et al. 2021, section 4.3).
 
-    Tasks should be on one scale: normalise returns first.
+    Tasks should be on one scale: normalize returns first.
 
     Args:
         scores: [runs, tasks], [runs], or a list of [runs] (see above).

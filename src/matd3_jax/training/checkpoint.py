@@ -24,8 +24,8 @@ from matd3_jax.errors import UserError
 from matd3_jax.runtime.multihost import ALONE, Share
 from matd3_jax.training.loop import TrainLoop, TrainState
 
-RENAMED = {".rollouts": ".collects"}
-"""Leaves by path, and what checkpoints from before call them."""
+RENAMED = ((".rollouts", ".collects"), ("_optimizer", "_optimiser"))
+"""Parts of leaves' paths, and what checkpoints from before have in their place."""
 
 logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax tells of every step at INFO and warns of its own defaults.
 
@@ -192,8 +192,10 @@ def _rebuild(trainer: TrainLoop, path: Path, share: Share) -> TrainState:
     names, treedef = jax.tree_util.tree_flatten_with_path(template)
     leaves = []
     for name, leaf in names:
-        path_of_leaf = jax.tree_util.keystr(name)
-        value = saved.get(path_of_leaf, saved.get(RENAMED.get(path_of_leaf, ""), np.array(np.nan)))
+        now = before = jax.tree_util.keystr(name)
+        for new, old in RENAMED:
+            before = before.replace(new, old)
+        value = saved.get(now, saved.get(before, np.array(np.nan)))
         wanted = (trainer.num_seeds, *leaf.shape[1:]) if leaf.ndim else ()
         if value.shape != wanted or value.dtype != leaf.dtype:
             raise UserError(f"{path}: {jax.tree_util.keystr(name)} does not fit these settings")

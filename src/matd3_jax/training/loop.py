@@ -34,7 +34,7 @@ class TrainState(NamedTuple):
     rollouts: chex.Array
     """int32 scalar: rollouts done, warm-up included. Steps, updates and the replay's cursor follow from it."""
     statistics: Statistics | None = None
-    """Of the observations collected; None where they are not normalised."""
+    """Of the observations collected; None where they are not normalized."""
     reservoir: Reservoir | None = None
     """What the critics are judged on (see `q_bias`); None where they are not. `since` has no axis [seeds]."""
 
@@ -66,7 +66,7 @@ class TrainLoop:
             `idle_devices`; elsewhere 1.
         piece: how many of a device's seeds are updated together; default 1 on CPU (a seed's batch stays in cache) and
             all of them elsewhere.
-        normalise_observations: networks see observations in units of their running mean and standard deviation; the
+        normalize_observations: networks see observations in units of their running mean and standard deviation; the
             replay keeps them as they are.
         least_deviation: of what observations are normalized by.
         q_bias_pairs: states and actions that each seed keeps for `measure_q_bias`; 0: none, and no trace of it in the
@@ -85,7 +85,7 @@ class TrainLoop:
         num_seeds: int,
         devices: Sequence[jax.Device] | None = None,
         piece: int | None = None,
-        normalise_observations: bool = False,
+        normalize_observations: bool = False,
         least_deviation: float = 0.0,
         q_bias_pairs: int = 0,
         unroll: int = 1,
@@ -94,7 +94,7 @@ class TrainLoop:
     ):
         self.env, self.layout, self.schedule, self.num_seeds = env, layout, schedule, num_seeds
         self.unroll, self.unroll_steps = unroll, unroll_steps
-        self.normalise_observations, self.q_bias_pairs = normalise_observations, q_bias_pairs
+        self.normalize_observations, self.q_bias_pairs = normalize_observations, q_bias_pairs
         self.least_deviation = least_deviation
         updates = schedule.updates_per_collect
         for group in layout.groups:
@@ -210,7 +210,7 @@ class TrainLoop:
             if self.q_bias_pairs:
                 pairs = jax.vmap(lambda s: q_bias.allocate(s, self.q_bias_pairs, self.layout))(env.state)
                 state = state._replace(reservoir=Reservoir(pairs, jnp.int32(0)))
-            if not self.normalise_observations:
+            if not self.normalize_observations:
                 return state
             fresh = running_statistics.initial(self.layout.observation_size)
             spread = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (keys.shape[0], *leaf.shape)), fresh)
@@ -230,7 +230,7 @@ class TrainLoop:
 
     def _fields(self, seeds: Any, everywhere: Any) -> TrainState:
         """A prefix tree of the state: what stands for leaves with and without the axis [seeds]."""
-        statistics = seeds if self.normalise_observations else None
+        statistics = seeds if self.normalize_observations else None
         reservoir = Reservoir(seeds, everywhere) if self.q_bias_pairs else None
         return TrainState(seeds, seeds, seeds, seeds, everywhere, statistics, reservoir)
 
@@ -338,7 +338,7 @@ class TrainLoop:
         self, state: TrainState, hyper: Sequence[HyperParams], seed: chex.Array | int, indices: chex.Array
     ) -> chex.Array:
         """What updates take: the rows [*indices.shape, row_size] of a local seed and its `hyper`, rewards of n_step
-        steps in them, observations normalised."""
+        steps in them, observations normalized."""
         schedule, layout = self.schedule, self.layout
         if layout.n_step == 1:
             rows = replay.gather(state.replay, seed, indices)
@@ -349,7 +349,7 @@ class TrainLoop:
         scale = self.scale(state)
         if scale is None:
             return rows
-        return running_statistics.normalise_rows(self.layout, jax.tree.map(lambda s: s[seed], scale), rows)
+        return running_statistics.normalize_rows(self.layout, jax.tree.map(lambda s: s[seed], scale), rows)
 
     def iteration(self, state: TrainState, hyper) -> tuple[TrainState, Metrics]:
         episodes, metrics = [], []

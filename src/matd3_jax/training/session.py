@@ -84,10 +84,10 @@ class TrainingSession:
             sequential=config.update_order == "sequential",
         )
         hyper = {team: self._hyper(team) for team in teams}
-        seeds, normalise = len(self.seeds), config.normalise_observations
+        seeds, normalize = len(self.seeds), config.normalize_observations
         local = jax.local_devices()
-        least = config.normalise_least_deviation
-        options: dict[str, Any] = {"normalise_observations": normalise, "least_deviation": least}
+        least = config.normalize_least_deviation
+        options: dict[str, Any] = {"normalize_observations": normalize, "least_deviation": least}
         trainer = TrainLoop(self.env, self.layout, schedule, hyper, seeds, local, **options)
         # Whole intervals of equal length, so that one compiled program does for all; as many as come closest to
         # log_every.

@@ -30,25 +30,25 @@ def check(path: Path, fps: float) -> None:
         raise UserError(f"out={path}: MP4 needs ffmpeg on the PATH; install it, or choose a name that ends with .gif")
 
 
-def write(path: Path, frames: Sequence[Image.Image], fps: float, colours: int = 64) -> None:
+def write(path: Path, frames: Sequence[Image.Image], fps: float, colors: int = 64) -> None:
     """Write `frames`, all of one size, to `path` (.gif or .mp4), an existing file included.
 
-    fps: frames per second; GIF rounds the time of a frame to hundredths of a second. colours: of a GIF, at most 256.
+    fps: frames per second; GIF rounds the time of a frame to hundredths of a second. colors: of a GIF, at most 256.
 
     Raises UserError as `check` does, and where writing fails.
     """
     check(path, fps)
     try:
         if path.suffix == ".gif":
-            _write_gif(path, frames, fps, colours)
+            _write_gif(path, frames, fps, colors)
         else:
             _write_mp4(path, frames, fps)
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror or error}") from error
 
 
-def _write_gif(path: Path, frames: Sequence[Image.Image], fps: float, colours: int) -> None:
-    palette = _palette(frames, colours)
+def _write_gif(path: Path, frames: Sequence[Image.Image], fps: float, colors: int) -> None:
+    palette = _palette(frames, colors)
     # Without dithering: what stands still stays the same from frame to frame, and is not stored again.
     flat = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     duration = 10 * round(100 / fps)
@@ -56,21 +56,21 @@ def _write_gif(path: Path, frames: Sequence[Image.Image], fps: float, colours: i
     flat[0].save(path, save_all=True, append_images=flat[1:], duration=durations, loop=0, optimize=True)
 
 
-def _palette(frames: Sequence[Image.Image], colours: int) -> Image.Image:
+def _palette(frames: Sequence[Image.Image], colors: int) -> Image.Image:
     """One palette for all frames, from some of them side by side."""
     picked = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, SAMPLES).round().astype(int))]
     width, height = picked[0].size
     strip = Image.new("RGB", (width * len(picked), height))
     for k, frame in enumerate(picked):
         strip.paste(frame, (k * width, 0))
-    # Not by how often a colour occurs: an agent is small on a large background. Then the means of what is nearest to
+    # Not by how often a color occurs: an agent is small on a large background. Then the means of what is nearest to
     # each: white stays white.
-    return strip.quantize(colours, method=Image.Quantize.MAXCOVERAGE, kmeans=2)
+    return strip.quantize(colors, method=Image.Quantize.MAXCOVERAGE, kmeans=2)
 
 
 def _write_mp4(path: Path, frames: Sequence[Image.Image], fps: float) -> None:
     width, height = frames[0].size
-    # Raw pictures in; out what every player takes: 4:2:0 colour, hence even sides.
+    # Raw pictures in; out what every player takes: 4:2:0 color, hence even sides.
     command = [
         "ffmpeg", "-y", "-loglevel", "error",
         "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps), "-i", "-",

@@ -12,7 +12,7 @@ from matd3_jax.envs.particle.task import ParticleTask
 from matd3_jax.envs.point_reach import PointReach
 from matd3_jax.envs.wrappers.joint_team import JointTeam
 from matd3_jax.errors import UserError
-from matd3_jax.figures.palette import BLACK, WHITE, Colour
+from matd3_jax.figures.palette import BLACK, WHITE, Color
 from matd3_jax.video import plane
 from matd3_jax.video.mujoco_renderer import RobotDrawing
 from matd3_jax.video.scene2d import Drawing, OwnDrawing, SceneDrawing
@@ -71,15 +71,15 @@ def compose(drawing: Drawing, selected: Any, captions: Sequence[str] | None, siz
 
 
 def _write_legend(
-    pen: ImageDraw.ImageDraw, legend: Sequence[tuple[str, Colour]], top: int, line: int, width: int
+    pen: ImageDraw.ImageDraw, legend: Sequence[tuple[str, Color]], top: int, line: int, width: int
 ) -> None:
     def length(face: FreeTypeFont) -> float:
         return sum(face.getlength(text) + 2 * face.size for text, _ in legend)
 
     face = _fitting(length, line, width)
     x, y, r = float(MARGIN), top + line / 2, 0.38 * face.size
-    for text, colour in legend:
-        pen.rectangle((x, y - r, x + 2 * r, y + r), fill=colour)
+    for text, color in legend:
+        pen.rectangle((x, y - r, x + 2 * r, y + r), fill=color)
         pen.text((x + face.size, y), text, fill=BLACK, font=face, anchor="lm")
         x += face.getlength(text) + 2 * face.size
 

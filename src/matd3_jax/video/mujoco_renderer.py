@@ -1,4 +1,4 @@
-"""Pictures of robots with MuJoCo's renderer: each agent's parts in a colour of its own."""
+"""Pictures of robots with MuJoCo's renderer: each agent's parts in a color of its own."""
 
 import copy
 from collections.abc import Iterator, Sequence
@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from matd3_jax.figures.palette import AGENT, Colour
+from matd3_jax.figures.palette import AGENT, Color
 from matd3_jax.video import opengl
 from matd3_jax.video.scene2d import Drawing
 
-TRUNK: Colour = (190, 190, 190)
+TRUNK: Color = (190, 190, 190)
 """Bodies that are nobody's own."""
-FLOOR: tuple[Colour, Colour] = ((196, 202, 210), (226, 230, 235))
-"""The two colours of a checkered floor; close to each other, so that the robot stands out."""
+FLOOR: tuple[Color, Color] = ((196, 202, 210), (226, 230, 235))
+"""The two colors of a checkered floor; close to each other, so that the robot stands out."""
 DISTANCE = 3.0
 """Of the camera, in half lengths of the robot."""
 SMOOTHING = 4
@@ -25,7 +25,7 @@ class RobotDrawing(Drawing):
     """Draws an environment that has `mj_model`, `agent_bodies` and `qpos(state)`.
 
     mj_model: the robot, a `mujoco.MjModel`. agent_bodies: for each agent the bodies that are its own. qpos: the
-    generalised positions [nq] in a state.
+    generalized positions [nq] in a state.
 
     Raises UserError where there is no OpenGL.
     """
@@ -35,7 +35,7 @@ class RobotDrawing(Drawing):
 
     def __init__(self, env: Any):
         self.env, self.new_context = env, opengl.context_class()
-        self.legend = tuple((agent, agent_colour(i)) for i, agent in enumerate(env.agents))
+        self.legend = tuple((agent, agent_color(i)) for i, agent in enumerate(env.agents))
 
     def select(self, state: Any) -> Any:
         return self.env.qpos(state)
@@ -56,10 +56,10 @@ class RobotDrawing(Drawing):
         renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         try:
             mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, renderer)
-            for place, centre in zip(qpos, path, strict=True):
+            for place, center in zip(qpos, path, strict=True):
                 data.qpos[:] = place
                 mujoco.mj_forward(model, data)
-                camera.lookat[:2] = centre
+                camera.lookat[:2] = center
                 mujoco.mjv_updateScene(model, data, option, perturb, camera, mujoco.mjtCatBit.mjCAT_ALL, scene)
                 context.make_current()  # whoever takes the pictures may draw something else in between
                 mujoco.mjr_render(rect, scene, renderer)
@@ -72,21 +72,21 @@ class RobotDrawing(Drawing):
             context.free()
 
 
-def agent_colour(agent: int) -> Colour:
-    """The colour of an agent's parts."""
+def agent_color(agent: int) -> Color:
+    """The color of an agent's parts."""
     return AGENT[agent % len(AGENT)]
 
 
 def painted(mj_model: Any, agent_bodies: Sequence[Sequence[int]]) -> Any:
-    """A copy of a `mujoco.MjModel` with agents in their colours, the rest of the robot grey, floor and sky light."""
+    """A copy of a `mujoco.MjModel` with agents in their colors, the rest of the robot grey, floor and sky light."""
     import mujoco
 
     model = copy.deepcopy(mj_model)
-    colour = {body: agent_colour(i) for i, bodies in enumerate(agent_bodies) for body in bodies}
+    color = {body: agent_color(i) for i, bodies in enumerate(agent_bodies) for body in bodies}
     for geom, body in enumerate(model.geom_bodyid):
         if body:
             model.geom_matid[geom] = -1
-            model.geom_rgba[geom, :3] = np.array(colour.get(int(body), TRUNK)) / 255
+            model.geom_rgba[geom, :3] = np.array(color.get(int(body), TRUNK)) / 255
         elif (material := model.geom_matid[geom]) >= 0:
             model.geom_rgba[geom] = 1
             model.mat_rgba[material] = 1
@@ -100,7 +100,7 @@ def painted(mj_model: Any, agent_bodies: Sequence[Sequence[int]]) -> Any:
         if model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
             _pixels(model, texture)[:] = 255
     model.vis.quality.shadowsize = 1024  # a quarter of the default: enough for small pictures, and much faster
-    # Light from everywhere, and from afar so that the floor has the same colours all over: a small GIF.
+    # Light from everywhere, and from afar so that the floor has the same colors all over: a small GIF.
     model.vis.headlight.ambient[:], model.vis.headlight.specular[:] = 0.7, 0
     model.vis.headlight.diffuse[:] = 0 if model.nlight else 0.35
     model.light_type[:] = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL

@@ -6,10 +6,10 @@ import numpy as np
 
 from matd3_jax.envs.particle.task import ParticleTask
 from matd3_jax.envs.particle.world import State
-from matd3_jax.figures.palette import DARK_GREY, GREEN, GREY, PALE_GREEN, PURPLE, TEAM, YELLOW, Colour
+from matd3_jax.figures.palette import DARK_GREY, GREEN, GREY, PALE_GREEN, PURPLE, TEAM, YELLOW, Color
 from matd3_jax.video.plane import Disc, Scene
 
-LANDMARK: dict[str, Colour] = {
+LANDMARK: dict[str, Color] = {
     "landmark": GREY,
     "obstacle": DARK_GREY,
     "goal": GREEN,
@@ -49,9 +49,9 @@ def scene(env: ParticleTask, states: State) -> Scene:
     return Scene(discs, note)
 
 
-def legend(env: ParticleTask) -> tuple[tuple[str, Colour], ...]:
-    """(what, colour) of what a scene shows."""
-    shown: dict[str, Colour] = {}
+def legend(env: ParticleTask) -> tuple[tuple[str, Color], ...]:
+    """(what, color) of what a scene shows."""
+    shown: dict[str, Color] = {}
     for agent, team in zip(env.agents, env.teams, strict=True):
         shown[_kind(agent)] = TEAM[team]
     if env.num_goals:
@@ -69,7 +69,7 @@ def _kind(agent: str) -> str:
 
 
 def _labels(agents: tuple[str, ...]) -> list[str]:
-    """Agents of one kind bear their numbers; who is known by name bears it; the only one of its colour bears none."""
+    """Agents of one kind bear their numbers; who is known by name bears it; the only one of its color bears none."""
     count = Counter(map(_kind, agents))
     return [
         _kind(agent)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from matd3_jax.figures.palette import BLACK, GREEN, PURPLE, WHITE, Colour
+from matd3_jax.figures.palette import BLACK, GREEN, PURPLE, WHITE, Color
 
 OVERSAMPLING = 3
 """Drawn so many times larger and then shrunk: smooth edges."""
@@ -23,8 +23,8 @@ BAR, CHART, WIDEST_CHART = 0.03, 0.1, 0.2
 """Width of a message's bars, their greatest height, and the most that all bars of a message take, as fractions of the
 picture's side."""
 
-GRID: Colour = (236, 236, 236)
-START: Colour = (190, 190, 190)
+GRID: Color = (236, 236, 236)
+START: Color = (190, 190, 190)
 """Of the square [-1, 1]^2."""
 
 Edges = tuple[float, float, float, float]
@@ -37,7 +37,7 @@ class Disc:
 
     position: np.ndarray
     radius: float
-    colour: Colour
+    color: Color
     label: str = ""
     """Written inside if it fits there, otherwise below."""
     ringed: bool = False
@@ -68,7 +68,7 @@ class Scene:
         return max(len(disc.position) for disc in self.discs if disc.moves)
 
     def view(self) -> tuple[np.ndarray, float]:
-        """(centre [2], half the side) of a square, one for the whole episode, that holds [-1, 1]^2 and every disc."""
+        """(center [2], half the side) of a square, one for the whole episode, that holds [-1, 1]^2 and every disc."""
         low, high = np.full(2, -1.0), np.full(2, 1.0)
         for disc in self.discs:
             places = disc.position.reshape(-1, 2)
@@ -88,13 +88,13 @@ class _Painter:
 
     def __init__(self, scene: Scene, side: int):
         self.scene, self.side = scene, side
-        self.centre, self.half = scene.view()
+        self.center, self.half = scene.view()
         self.font = font(max(9, round(side * 0.034)))
         self.background = self._background()
 
     def pixel(self, place: np.ndarray) -> np.ndarray:
         """Pixels (right, down) of a place [2] in the world."""
-        unit = (np.asarray(place, float) - self.centre) / (2 * self.half)
+        unit = (np.asarray(place, float) - self.center) / (2 * self.half)
         return np.array([0.5 + unit[0], 0.5 - unit[1]]) * self.side
 
     def radius(self, disc: Disc) -> float:
@@ -122,7 +122,7 @@ class _Painter:
         layer = Image.new("RGB", (size, size), WHITE)
         pen = ImageDraw.Draw(layer)
         step = 0.5 if self.half < 2.5 else 2.0 ** np.ceil(np.log2(self.half / 4))
-        ends = self.centre - self.half, self.centre + self.half
+        ends = self.center - self.half, self.center + self.half
         for axis in range(2):
             for value in np.arange(np.ceil(ends[0][axis] / step), np.floor(ends[1][axis] / step) + 1) * step:
                 self._line(pen, axis, value, (ends[0][1 - axis], ends[1][1 - axis]), GRID)
@@ -131,24 +131,22 @@ class _Painter:
                 self._line(pen, axis, value, (-1.0, 1.0), START)
         return layer
 
-    def _line(
-        self, pen: ImageDraw.ImageDraw, axis: int, value: float, ends: tuple[float, float], colour: Colour
-    ) -> None:
+    def _line(self, pen: ImageDraw.ImageDraw, axis: int, value: float, ends: tuple[float, float], color: Color) -> None:
         """Where coordinate `axis` has this value, the other one between `ends`: on whole pixels, hence crisp."""
         corners = [np.floor(self.pixel(np.array([value, end] if axis == 0 else [end, value]))) for end in ends]
         low, high = np.minimum(*corners) * OVERSAMPLING, (np.maximum(*corners) + 1) * OVERSAMPLING - 1
-        pen.rectangle((*low, *high), fill=colour)
+        pen.rectangle((*low, *high), fill=color)
 
     def _disc(self, pen: ImageDraw.ImageDraw, disc: Disc, frame: int) -> None:
         x, y = self.pixel(disc.place(frame)) * OVERSAMPLING
         r = self.radius(disc) * OVERSAMPLING
-        pen.ellipse((x - r, y - r, x + r, y + r), fill=(*disc.colour, OPACITY if disc.moves else 255))
+        pen.ellipse((x - r, y - r, x + r, y + r), fill=(*disc.color, OPACITY if disc.moves else 255))
         if disc.moves:
-            edge = tuple(round(0.6 * c) for c in disc.colour)
+            edge = tuple(round(0.6 * c) for c in disc.color)
             pen.ellipse((x - r, y - r, x + r, y + r), outline=edge, width=round(1.3 * OVERSAMPLING))
         if disc.ringed:
             r += 4 * OVERSAMPLING
-            pen.ellipse((x - r, y - r, x + r, y + r), outline=disc.colour, width=2 * OVERSAMPLING)
+            pen.ellipse((x - r, y - r, x + r, y + r), outline=disc.color, width=2 * OVERSAMPLING)
 
     def _label(self, pen: ImageDraw.ImageDraw, disc: Disc, frame: int) -> None:
         if not disc.label:

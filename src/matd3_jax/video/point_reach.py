@@ -4,13 +4,13 @@ import numpy as np
 
 from matd3_jax.envs.point_reach import PointReach, PointState
 from matd3_jax.errors import OptionError
-from matd3_jax.figures.palette import BLUE, GREEN, Colour
+from matd3_jax.figures.palette import BLUE, GREEN, Color
 from matd3_jax.video.plane import Disc, Scene
 
 RADIUS, TARGET_RADIUS = 0.06, 0.05
 """Points have no size; their drawings have."""
 
-LEGEND: tuple[tuple[str, Colour], ...] = (("agent", BLUE), ("target", GREEN))
+LEGEND: tuple[tuple[str, Color], ...] = (("agent", BLUE), ("target", GREEN))
 
 
 def scene(env: PointReach, states: PointState) -> Scene:

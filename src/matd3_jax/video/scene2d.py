@@ -11,7 +11,7 @@ from PIL import Image
 from matd3_jax.envs.particle.task import ParticleTask
 from matd3_jax.envs.point_reach import PointReach
 from matd3_jax.errors import UserError
-from matd3_jax.figures.palette import Colour
+from matd3_jax.figures.palette import Color
 from matd3_jax.video import particle as particle_drawing
 from matd3_jax.video import point_reach
 
@@ -23,8 +23,8 @@ class Drawing(abc.ABC):
     """Width over height."""
     fps: int = 10
     """Pictures per second that look natural."""
-    legend: Sequence[tuple[str, Colour]] = ()
-    """(what, its colour)."""
+    legend: Sequence[tuple[str, Color]] = ()
+    """(what, its color)."""
 
     def select(self, state: Any) -> Any:
         """What of one state the pictures need: traceable."""

@@ -10,7 +10,7 @@ from matd3_jax.envs.particle.world import State, World, choose, distance_of, one
 
 ADVERSARY, GOOD = 0, 1
 NUM_LANDMARKS = 2
-LANDMARK_COLOURS = (0.1, 0.9, 0.1, 0.1, 0.1, 0.9)
+LANDMARK_COLORS = (0.1, 0.9, 0.1, 0.1, 0.1, 0.9)
 """Red, green, blue of each landmark."""
 
 
@@ -19,8 +19,8 @@ class SimplePush(ParticleTask):
     """An adversary, a good agent, two landmarks, one of them the goal.
 
     Observation of the adversary [8]: own velocity 2, landmarks relative to oneself 4, the good agent likewise 2. Of
-    the good agent [19]: own velocity 2, goal relative to oneself 2, own colour 3 (it tells the goal), landmarks
-    relative to oneself 4, colours of the landmarks 6, the adversary relative to oneself 2.
+    the good agent [19]: own velocity 2, goal relative to oneself 2, own color 3 (it tells the goal), landmarks
+    relative to oneself 4, colors of the landmarks 6, the adversary relative to oneself 2.
 
     Reward: the good agent gets minus its distance to the goal; the adversary gets that distance minus its own. Same
     in both rules.
@@ -50,13 +50,13 @@ class SimplePush(ParticleTask):
         assert state.goal is not None
         dtype = state.pos.dtype
         goal = choose(state.goal, state.landmark) - state.pos[GOOD]
-        colour = 0.25 + 0.5 * one_hot(state.goal + 1, 3, dtype)
-        landmark_colours = jnp.asarray(LANDMARK_COLOURS, dtype)
+        color = 0.25 + 0.5 * one_hot(state.goal + 1, 3, dtype)
+        landmark_colors = jnp.asarray(LANDMARK_COLORS, dtype)
         adversary, good = ((state.landmark - state.pos[i]).reshape(-1) for i in (ADVERSARY, GOOD))
         to_good = state.pos[GOOD] - state.pos[ADVERSARY]
         return (
             jnp.concatenate([state.vel[ADVERSARY], adversary, to_good]),
-            jnp.concatenate([state.vel[GOOD], goal, colour, good, landmark_colours, -to_good]),
+            jnp.concatenate([state.vel[GOOD], goal, color, good, landmark_colors, -to_good]),
         )
 
     def reward(self, state: State) -> chex.Array:

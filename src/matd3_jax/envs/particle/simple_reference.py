@@ -16,7 +16,7 @@ class SimpleReference(ParticleTask):
     """Two agents that move and speak, three landmarks; `State.goal[i]` is the landmark to which the agent that is not i
     should go. Both goals may be the same landmark.
 
-    Observation [21]: own velocity 2, landmarks relative to oneself 6, colour of the other's goal 3 (0.25, and 0.75 at
+    Observation [21]: own velocity 2, landmarks relative to oneself 6, color of the other's goal 3 (0.25, and 0.75 at
     the goal's index), the other's message 10.
 
     Reward, with d_i the distance of the agent that is not i to goal[i]: "orig" gives both -(d_0^2 + d_1^2); "mpe2"

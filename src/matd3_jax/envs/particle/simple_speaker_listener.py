@@ -15,7 +15,7 @@ NUM_LANDMARKS = 3
 class SimpleSpeakerListener(ParticleTask):
     """An immovable speaker, a silent listener, three landmarks, one of them the goal.
 
-    Observation of the speaker [3]: colour of the goal, 0.15 and 0.65 at the goal's index. Of the listener [11]: own
+    Observation of the speaker [3]: color of the goal, 0.15 and 0.65 at the goal's index. Of the listener [11]: own
     velocity 2, landmarks relative to oneself 6, the speaker's message 3.
 
     Reward of both: minus the squared distance of listener and goal; twice that under "orig", which adds both rewards.
@@ -43,8 +43,8 @@ class SimpleSpeakerListener(ParticleTask):
 
     def observe(self, state: State) -> tuple[chex.Array, ...]:
         assert state.comm is not None and state.goal is not None
-        colour = 0.15 + 0.5 * one_hot(state.goal, NUM_LANDMARKS, state.pos.dtype)
-        return colour, jnp.concatenate([state.vel[1], (state.landmark - state.pos[1]).reshape(-1), state.comm[0]])
+        color = 0.15 + 0.5 * one_hot(state.goal, NUM_LANDMARKS, state.pos.dtype)
+        return color, jnp.concatenate([state.vel[1], (state.landmark - state.pos[1]).reshape(-1), state.comm[0]])
 
     def reward(self, state: State) -> chex.Array:
         assert state.goal is not None

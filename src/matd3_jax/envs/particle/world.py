@@ -108,7 +108,7 @@ class World:
         reach = _constant(np.add.outer(self.radius, radius), pos)
         delta = pos[:, None] - other[None]
         # Squares that are zero, the agent beside itself among them, become 1: no contact, finite slope, and delta is 0.
-        # Flat, so that XLA on CPU has an inner loop long enough to vectorise.
+        # Flat, so that XLA on CPU has an inner loop long enough to vectorize.
         square = jnp.sum(delta**2, axis=-1).reshape(-1)
         distance = jnp.sqrt(jnp.where(square > 0, square, 1))
         depth = (reach.reshape(-1) - distance) / CONTACT_MARGIN
@@ -132,7 +132,7 @@ def softplus(x: chex.Array) -> chex.Array:
     """log(1 + exp(x)) to 2e-13, for any x.
 
     With e = exp(-|x|) it is (x + |x|) / 2 + log(1 + e), and log(1 + e) = 2 artanh(e / (2 + e)), whose series is short
-    as its argument is at most 1/3. XLA on CPU does not vectorise log1p here: this makes contacts four times as fast.
+    as its argument is at most 1/3. XLA on CPU does not vectorize log1p here: this makes contacts four times as fast.
     """
     size = jnp.abs(x)
     e = jnp.exp(-size)

@@ -16,7 +16,7 @@ class Ant(Robot):
     """Ant-v2 (Brockman et al. 2016; Schulman et al. 2016) of gymnasium's model file; 0.05 s an env step.
 
     Full observation [111]: qpos[2:] (13), qvel (14), the external torque and force on each of 14 bodies about the
-    robot's centre of mass, clipped to [-1, 1] (84; the first six, the world's, are always 0; all are 0 after a reset).
+    robot's center of mass, clipped to [-1, 1] (84; the first six, the world's, are always 0; all are 0 after a reset).
 
     Reward: speed of the torso along x (m/s) + 1 - 0.5 |a|^2 - 0.0005 |clipped forces|^2; the 1 also on the step that
     terminates. Terminated: torso below 0.2 m or above 1 m. Reset: uniform noise of 0.1 on positions, normal noise of

@@ -19,7 +19,7 @@ class BraxState(NamedTuple):
     """State of one environment."""
 
     pipeline: Any
-    """brax's physics state; `q` and `qd` in it are the generalised positions and velocities."""
+    """brax's physics state; `q` and `qd` in it are the generalized positions and velocities."""
     full_observation: chex.Array
     """[full_observation_size]; kept, as the humanoid's shows the last action's forces, which the physics forgets."""
     measured: chex.Array
@@ -37,7 +37,7 @@ class BraxRobot(Environment):
     `split` says who moves which joints and `depth` what is seen of them: see `partition.partition`. An action is in
     [-1, 1] for each joint (brax scales the humanoid's to its motors).
 
-    The full observation is brax's: generalised positions without those along the floor, and velocities (m, rad, m/s,
+    The full observation is brax's: generalized positions without those along the floor, and velocities (m, rad, m/s,
     rad/s; hopper's and walker2d's velocities clipped to [-10, 10]). The humanoid's goes on with inertia [10] and
     velocity [6] of each of 11 links and the motors' forces [23]. No contact forces. Sizes: ant 27, half_cheetah 17,
     hopper 11, walker2d 17, humanoid 244, swimmer 8.
@@ -107,7 +107,7 @@ class BraxRobot(Environment):
         return self.partition.bodies
 
     def qpos(self, state: BraxState) -> chex.Array:
-        """Generalised positions for `mj_model`: [nq], m and rad, free joints with a quaternion (w, x, y, z)."""
+        """Generalized positions for `mj_model`: [nq], m and rad, free joints with a quaternion (w, x, y, z)."""
         return state.pipeline.q
 
     def reset(self, key: chex.PRNGKey) -> tuple[BraxState, tuple[chex.Array, ...]]:

@@ -18,10 +18,10 @@ class Humanoid(Robot):
     gymnasium's model asks for MuJoCo's PGS solver, which MJX lacks: there Newton's method solves the same problem (see
     docs/environments.md for the difference).
 
-    Full observation [348]: qpos[2:] (22), qvel (23), of 13 bodies inertia about the centre of mass (130) and velocity
+    Full observation [348]: qpos[2:] (22), qvel (23), of 13 bodies inertia about the center of mass (130) and velocity
     (78), force of the actuators on the joints (17), external torque and force on 13 bodies (78; 0 after a reset).
 
-    Reward: 1.25 times the speed of the centre of mass along x (m/s) + 5 while healthy - 0.1 |a|^2 - 5e-7 |external
+    Reward: 1.25 times the speed of the center of mass along x (m/s) + 5 while healthy - 0.1 |a|^2 - 5e-7 |external
     forces|^2, the last at most 10. Terminated: torso outside (1, 2) m of height. Reset: uniform noise of 0.01 on
     positions and velocities. `split`: "9|8", "single", or joint names.
     """

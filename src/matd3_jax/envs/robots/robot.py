@@ -25,9 +25,9 @@ class RobotState(NamedTuple):
     """One robot between two env steps."""
 
     qpos: chex.Array
-    """[nq] generalised positions: m, unit quaternion (w, x, y, z), rad."""
+    """[nq] generalized positions: m, unit quaternion (w, x, y, z), rad."""
     qvel: chex.Array
-    """[nv] generalised velocities."""
+    """[nv] generalized velocities."""
     qacc_warmstart: chex.Array
     """[nv] where the solver starts."""
     sensed: tuple[chex.Array, ...]
@@ -140,7 +140,7 @@ class Robot(Environment):
         return state, self.observe(state)
 
     def state(self, qpos: chex.Array, qvel: chex.Array) -> RobotState:
-        """The start of an episode at positions [nq] and velocities [nv]; quaternions are normalised."""
+        """The start of an episode at positions [nq] and velocities [nv]; quaternions are normalized."""
         if self.mj_model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE:
             qpos = qpos.at[3:7].divide(jnp.linalg.norm(qpos[3:7]))
         sensed, progress = self.start(qpos, qvel)
@@ -210,7 +210,7 @@ class Robot(Environment):
         return self.partition.bodies
 
     def qpos(self, state: RobotState) -> chex.Array:
-        """Generalised positions [nq] for `mj_model`."""
+        """Generalized positions [nq] for `mj_model`."""
         return state.qpos
 
     @property

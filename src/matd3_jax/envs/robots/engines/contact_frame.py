@@ -22,7 +22,7 @@ def plane_capsule(plane, capsule):
     normal, axis = plane.mat[:, 2], capsule.mat[:, 2]
     along = axis - normal * jnp.dot(normal, axis)
     square = jnp.dot(along, along)
-    upright = square < 1e-30  # exactly upright: C's normalisation of a vector of length 0 gives the x axis
+    upright = square < 1e-30  # exactly upright: C's normalization of a vector of length 0 gives the x axis
     unit = along / jnp.sqrt(jnp.where(upright, 1, square))
     tangent = jnp.where(upright, jnp.array([1.0, 0, 0], unit.dtype), unit)
     frame = jnp.stack([normal, tangent, jnp.cross(normal, tangent)])

@@ -10,7 +10,7 @@ from matd3_jax.envs.robots.engines.quietly import forward, mjx
 def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """`mjx.step` for the integrator RK4 and models without activations.
 
-    The same numbers up to rounding (stage 1 normalises the quaternion once more). MJX writes the dynamics out four
+    The same numbers up to rounding (stage 1 normalizes the quaternion once more). MJX writes the dynamics out four
     times, once for every stage; one loop body compiles in less than two thirds of the time. As in MuJoCo, all but
     `qpos` and `qvel` is left as the last stage computed it.
     """

@@ -11,7 +11,7 @@ class Joint:
 
     name: str
     qpos: int
-    """Index of its generalised position."""
+    """Index of its generalized position."""
     qvel: int
     """Index of its degree of freedom."""
     actuator: int
@@ -27,7 +27,7 @@ class KinematicTree:
     joints: tuple[Joint, ...]
     """The actuated joints, in the order of their positions."""
     root_qpos: tuple[int, ...]
-    """Generalised positions that no actuator moves: where the robot is."""
+    """Generalized positions that no actuator moves: where the robot is."""
     root_qvel: tuple[int, ...]
     """Degrees of freedom that no actuator moves."""
     parents: tuple[int, ...]

@@ -13,13 +13,13 @@ class Layout:
     size: int
     """Entries of the full observation."""
     qpos: tuple[int | None, ...]
-    """Entry of each generalised position."""
+    """Entry of each generalized position."""
     qvel: tuple[int | None, ...]
-    """Entry of each generalised velocity (degree of freedom)."""
+    """Entry of each generalized velocity (degree of freedom)."""
     cinert: tuple[int | None, ...] = ()
-    """First of the 10 entries (inertia about the centre of mass) of each body, the world being body 0."""
+    """First of the 10 entries (inertia about the center of mass) of each body, the world being body 0."""
     cvel: tuple[int | None, ...] = ()
-    """First of the 6 entries (velocity at the centre of mass) of each body."""
+    """First of the 6 entries (velocity at the center of mass) of each body."""
     qfrc_actuator: tuple[int | None, ...] = ()
     """Entry of the actuators' force on each degree of freedom."""
     cfrc_ext: tuple[int | None, ...] = ()

@@ -101,7 +101,7 @@ def partition(robot: str, tree: KinematicTree, layout: Layout, split: Any, depth
             observations = [_paper_observation(joints, tree, layout) for joints in owned]
         else:
             steps = 1 if depth is None else depth
-            observations = [_neighbourhood_observation(joints, graph, tree, layout, steps) for joints in owned]
+            observations = [_neighborhood_observation(joints, graph, tree, layout, steps) for joints in owned]
     return Partition(
         agents=tuple(f"agent_{i}" for i in range(len(owned))),
         joints=tuple(tuple(joint.name for joint in joints) for joints in owned),
@@ -150,7 +150,7 @@ def _paper_observation(own: Sequence[Joint], tree: KinematicTree, layout: Layout
     return tuple(i for entry in entries for i in entry)
 
 
-def _neighbourhood_observation(
+def _neighborhood_observation(
     own: Sequence[Joint], graph: Graph, tree: KinematicTree, layout: Layout, depth: int
 ) -> tuple[int, ...]:
     def label(joint: Joint) -> str:
