@@ -2,8 +2,8 @@
 
     python -m experiments.robots [only=PATTERN] [seeds=3] [train=true] [key=value ...]
 
-One recipe for all of them; the Ant in two halves is in `experiments.ant`. Beside the returns stand those of HARL's MATD3
-(Zhong et al. 2024), read off its figures.
+One recipe for all of them; the Ant in two halves is in `experiments.ant`. Beside the returns stand those of HARL's
+MATD3 (Zhong et al. 2024), read off its figures.
 """
 
 from collections.abc import Mapping, Sequence
