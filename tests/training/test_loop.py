@@ -14,6 +14,7 @@ from ledger import ENDS, HYPER, LIMIT, Ledger, by_hand
 from matd3_jax.core import rollout, update
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
+from matd3_jax.training import loop
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.schedule import Schedule
 
@@ -285,6 +286,20 @@ def test_devices_and_pieces_and_chunks_and_unrolling():
     same(plain(state), states[3], slice(0, 3), slice(0, 3))
     short = jax.tree.map(lambda *m: np.concatenate(m, axis=1)[:3], *metrics)
     # float32 as in `same`; returns are sums of some hundred.
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), plain(long), short)
+
+
+def test_seeds_apart(monkeypatch):
+    """Networks of each seed in arrays of their own inside the program, as for large ones: the same numbers, in the same
+    form."""
+    together, states, _, metrics = main_run()
+    monkeypatch.setattr(loop, "APART_BYTES", 0)
+    trainer = make([0, 1, 2], tau=1.0)
+    assert trainer.seeds_apart and not together.seeds_apart and trainer.local_seeds == 2
+    assert not make([0, 1, 2], devices=jax.devices()[:1], piece=3).seeds_apart  # updated in one batch
+    state, long = trainer.interval(3)(start(trainer, [0, 1, 2])[0])
+    same(plain(state), states[3], slice(None), slice(None))
+    short = jax.tree.map(lambda *m: np.concatenate(m, axis=1), *metrics)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), plain(long), short)
 
 

@@ -22,6 +22,9 @@ from matd3_jax.core.update import GroupState, UpdateMetrics
 from matd3_jax.envs.environment import Environment
 from matd3_jax.training.schedule import Schedule
 
+APART_SEEDS, APART_BYTES = 4, 4 * 2**20
+"""Up to so many seeds of a device, whose networks and moments take more bytes each, stand apart (`seeds_apart`)."""
+
 
 class TrainState(NamedTuple):
     """Everything that training carries; leading axis [seeds] but for `rollouts`."""
@@ -121,6 +124,16 @@ class TrainLoop:
             jax.tree.map(lambda h: jnp.broadcast_to(jnp.asarray(h, jnp.float32), num_seeds), h) for h in per_group
         ]
         self.hyper = tuple(jax.tree.map(self.fill, spread))
+
+    @cached_property
+    def seeds_apart(self) -> bool:
+        """Whether a program holds the networks of each seed as arrays of their own, its updates one seed after another
+        without a loop. A loop over seeds copies each seed's networks out of the stack and back: at 400-300 units that
+        took as long as the updates themselves. More seeds would take long to compile."""
+        groups = jax.eval_shape(lambda key: update.init(self.layout, key), jax.random.key(0))
+        size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(groups))
+        few = 1 < self.local_seeds <= APART_SEEDS and self.piece == 1
+        return self.on_cpu and few and size > APART_BYTES
 
     # ---- the schedule in numbers -------------------------------------------------------------------------------------
 
@@ -243,10 +256,14 @@ class TrainLoop:
             hyper: of the seeds in `state`; default: of all.
             average: with the averaged actors, where there are any.
         """
-        averages = [group.actor_average if average else None for group in state.groups]
-        actors = tuple(
-            group.actor if mean is None else mean for group, mean in zip(state.groups, averages, strict=True)
-        )
+        if isinstance(state.groups, list):  # inside a program whose seeds are apart
+            each = zip(*([group.actor for group in groups] for groups in state.groups), strict=True)
+            actors = tuple(_stack(one) for one in each)
+        else:
+            averages = [group.actor_average if average else None for group in state.groups]
+            actors = tuple(
+                group.actor if mean is None else mean for group, mean in zip(state.groups, averages, strict=True)
+            )
         return PolicyParams(actors, self.hyper if hyper is None else hyper, self.scale(state))
 
     def scale(self, state: TrainState) -> Statistics | None:
@@ -327,7 +344,15 @@ class TrainLoop:
 
         keys = jax.vmap(partial(jax.random.split, num=2))(state.key)
         seeds = jnp.arange(keys.shape[0])
-        states, metrics = jax.lax.map(one, (seeds, state.groups, keys[:, 0], hyper), batch_size=self.piece)
+        if isinstance(state.groups, list):
+            rest = (seeds, keys[:, 0], hyper)
+            found = []
+            for s, networks in enumerate(state.groups):
+                seed, key, own = jax.tree.map(lambda leaf, s=s: leaf[s], rest)
+                found.append(one((seed, networks, key, own)))
+            states, metrics = [networks for networks, _ in found], _stack([m for _, m in found])
+        else:
+            states, metrics = jax.lax.map(one, (seeds, state.groups, keys[:, 0], hyper), batch_size=self.piece)
         # The next rollout writes where these updates read. Where the actor is delayed nothing else tells XLA to do one
         # after the other, and it would copy the whole replay: so let the count of rollouts, hence the place of the next
         # write, hang on the updates. A mean squared error is never negative; XLA does not know.
@@ -372,9 +397,15 @@ class TrainLoop:
         `lax.scan`."""
 
         def repeat(state, hyper):
+            if self.seeds_apart:
+                seeds = range(state.key.shape[0])
+                apart = [jax.tree.map(lambda leaf, s=s: leaf[s], state.groups) for s in seeds]
+                state = state._replace(groups=apart)
             state, outputs = jax.lax.scan(
                 lambda s, _: iteration(s, hyper), state, length=iterations, unroll=self.unroll
             )
+            if self.seeds_apart:
+                state = state._replace(groups=_stack(state.groups))
             return state, jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), outputs)
 
         specs = (self._specs, P("seeds"))
@@ -423,6 +454,11 @@ class TrainLoop:
         assert state.reservoir is not None
         since = jax.device_put(np.int32(state.rollouts), self.shardings.reservoir.since)  # type: ignore[union-attr]
         return state._replace(reservoir=state.reservoir._replace(since=since))
+
+
+def _stack(trees: Sequence[Any]) -> Any:
+    """Leaves with a leading axis [trees]."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
 
 
 class Program(NamedTuple):
