@@ -104,8 +104,8 @@ def measure() -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
         loops.append(loop.cycle_seconds(calls))
         begun = time.perf_counter()
         loop.state, _ = jax.block_until_ready(trainer.warm_up(loop.state))
-        rollouts = (time.perf_counter() - begun) / trainer.schedule.warmup_rollouts
-        rollouts.append(trainer.rollouts_per_iteration * rollouts)
+        each = (time.perf_counter() - begun) / trainer.schedule.warmup_rollouts
+        rollouts.append(trainer.rollouts_per_iteration * each)
         rates.append(throughput.matmul_gflops(2))
     around = (np.array(rates[1:]) + np.array(rates[:-1])) / 2
     in_turns = {
