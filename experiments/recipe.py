@@ -29,6 +29,9 @@ CHANGES: dict[str, list[str]] = {
     "1 update of 1024": ["updates_per_collect=1", "batch_size=1024"],
     "n-step 5": ["n_step=5"],
     "averaged actor": ["algo.actor_average=0.001"],
+    "outputs penalized by 0.01": ["algo.logit_regularizer=0.01"],
+    "outputs penalized by 0.1": ["algo.logit_regularizer=0.1"],
+    "outputs penalized by 1": ["algo.logit_regularizer=1"],
     "delay 1": ["algo.policy_delay=1"],
     "normalized, deviation at least 0.1": ["normalize_observations=true", "normalize_least_deviation=0.1"],
     "rewards scaled by 0.1": ["algo.reward_scale=0.1"],
@@ -43,6 +46,7 @@ transitions that the agents share after 16 env steps."""
 KEYS = {
     "actor_output": "algo.actor_output",
     "actor_average": "algo.actor_average",
+    "logit_regularizer": "algo.logit_regularizer",
     "exploration_noise": "algo.exploration_noise",
     "updates_per_collect": "updates_per_collect",
     "batch_size": "batch_size",
