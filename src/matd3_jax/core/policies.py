@@ -81,7 +81,7 @@ class DeterministicPolicy:
 
     def smooth(self, action: chex.Array, draw: chex.Array, sigma: chex.Array, clip: chex.Array) -> chex.Array:
         epsilon = jnp.clip(sigma * draw, -clip, clip)
-        return self._inside(action + epsilon * (self.space.high - self.space.low) / 2)
+        return self._inside(action + epsilon * self.half)
 
     def noise(self, key: chex.PRNGKey, shape: tuple[int, ...]) -> chex.Array:
         return flat_draw(jax.random.normal, key, (*shape, self.size))

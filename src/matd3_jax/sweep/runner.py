@@ -135,6 +135,7 @@ class Piece:
         ends = np.cumsum([config.seeds for config in self.members])
         self.seeds = [slice(end - config.seeds, end) for end, config in zip(ends.tolist(), self.members, strict=True)]
         """Where each run's seeds are."""
+        self.table = TableLogger(self.runs, self.seeds)
 
     def train(self, stop: Stop) -> None:
         """From the last checkpoint, or from the start, to the end or until a signal comes."""
@@ -146,7 +147,7 @@ class Piece:
         loggers: list[Logger] = []
         if self.processes.first:
             progress = ProgressBar(training, row)
-            loggers = [TableLogger(self.runs, self.seeds), progress]
+            loggers = [self.table, progress]
             if settings.tensorboard:
                 loggers.append(TensorBoardLogger(self.runs, self.seeds))
 
@@ -167,7 +168,7 @@ class Piece:
                 run.clear()
             state, row = self.training.start()
             if first:
-                TableLogger(self.runs, self.seeds).log(row)
+                self.table.log(row)
             return state, row
         saved = Path(tell(str(checkpoint.verify(self.checkpoints)) if first else None))
         state, done = checkpoint.restore(saved, self.training.trainer, self.training.share), int(saved.name)

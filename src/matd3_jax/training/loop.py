@@ -345,11 +345,10 @@ class TrainLoop:
         keys = jax.vmap(partial(jax.random.split, num=2))(state.key)
         seeds = jnp.arange(keys.shape[0])
         if isinstance(state.groups, list):
-            rest = (seeds, keys[:, 0], hyper)
-            found = []
-            for s, networks in enumerate(state.groups):
-                seed, key, own = jax.tree.map(lambda leaf, s=s: leaf[s], rest)
-                found.append(one((seed, networks, key, own)))
+            rest = _unstack((seeds, keys[:, 0], hyper), len(state.groups))
+            found = [
+                one((seed, networks, key, own)) for networks, (seed, key, own) in zip(state.groups, rest, strict=True)
+            ]
             states, metrics = [networks for networks, _ in found], _stack([m for _, m in found])
         else:
             states, metrics = jax.lax.map(one, (seeds, state.groups, keys[:, 0], hyper), batch_size=self.piece)
@@ -398,9 +397,7 @@ class TrainLoop:
 
         def repeat(state, hyper):
             if self.seeds_apart:
-                seeds = range(state.key.shape[0])
-                apart = [jax.tree.map(lambda leaf, s=s: leaf[s], state.groups) for s in seeds]
-                state = state._replace(groups=apart)
+                state = state._replace(groups=_unstack(state.groups, state.key.shape[0]))
             state, outputs = jax.lax.scan(
                 lambda s, _: iteration(s, hyper), state, length=iterations, unroll=self.unroll
             )
@@ -459,6 +456,11 @@ class TrainLoop:
 def _stack(trees: Sequence[Any]) -> Any:
     """Leaves with a leading axis [trees]."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+
+def _unstack(tree: Any, count: int) -> list[Any]:
+    """The inverse of `_stack`."""
+    return [jax.tree.map(lambda leaf, k=k: leaf[k], tree) for k in range(count)]
 
 
 class Program(NamedTuple):
