@@ -21,7 +21,15 @@ from matd3_jax.core.algorithm import Algorithm, HyperParams
 from matd3_jax.errors import OptionError, UserError, nearest
 from matd3_jax.runtime import slurm
 
-ADDED_TO_ALGO = {"actor_output": "sigmoid", "actor_average": 0.0, "reward_scale": 1.0}
+ADDED_TO_ALGO = {
+    "actor_output": "sigmoid",
+    "actor_average": 0.0,
+    "reward_scale": 1.0,
+    "critic_norm": "none",
+    "critic_head": "scalar",
+    "critic_atoms": 51,
+    "critic_range": None,
+}
 """`ADDED_LATER` of an algorithm's group."""
 ADDED_LATER = {
     "recipe": "paper",
@@ -83,6 +91,10 @@ class AlgoConfig:
     actor_output: str
     actor_average: float
     reward_scale: float
+    critic_norm: str
+    critic_head: str
+    critic_atoms: int
+    critic_range: tuple[float, float] | None
 
     def algorithm(self) -> Algorithm:
         """What fixes the shape of the learner."""

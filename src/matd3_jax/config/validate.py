@@ -10,6 +10,8 @@ if TYPE_CHECKING:
 
 CHOICES = {
     "critic": ("central", "own"),
+    "critic_norm": ("none", "layer"),
+    "critic_head": ("scalar", "categorical"),
     "clip": ("variable", "network", "none"),
     "adam": ("standard", "epsilon_hat"),
     "actor_output": ("sigmoid", "tanh"),
@@ -81,6 +83,15 @@ def check(config: "Config") -> None:
 def _check_team(name: str, team: "AlgoConfig", updates: int, need: Any) -> None:
     for key in ("num_critics", "policy_delay"):
         need(getattr(team, key) >= 1, f"{name}.{key}={getattr(team, key)}: must be at least 1")
+    need(team.critic_atoms >= 2, f"{name}.critic_atoms={team.critic_atoms}: must be at least 2")
+    need(
+        team.critic_head != "categorical" or team.critic_range is not None,
+        f"{name}.critic_head=categorical needs the range of returns: {name}.critic_range=[low,high]",
+    )
+    if team.critic_range is not None:
+        low, high = team.critic_range
+        shown = f"{name}.critic_range={list(team.critic_range)}"
+        need(-math.inf < low < high < math.inf, f"{shown}: the first number must be below the second, both finite")
     need(
         updates % team.policy_delay == 0 or team.policy_delay % updates == 0,
         f"updates_per_collect={updates} is not a multiple of {name}.policy_delay={team.policy_delay} (nor divides it)",
