@@ -89,9 +89,9 @@ def _check_team(name: str, team: "AlgoConfig", updates: int, need: Any) -> None:
         f"{name}.critic_head=categorical needs the range of returns: {name}.critic_range=[low,high]",
     )
     if team.critic_range is not None:
-        low, high = team.critic_range
-        shown = f"{name}.critic_range={list(team.critic_range)}"
-        need(-math.inf < low < high < math.inf, f"{shown}: the first number must be below the second, both finite")
+        first, last = team.critic_range
+        text = f"{name}.critic_range={list(team.critic_range)}"
+        need(-math.inf < first < last < math.inf, f"{text}: the first number must be below the second, both finite")
     need(
         updates % team.policy_delay == 0 or team.policy_delay % updates == 0,
         f"updates_per_collect={updates} is not a multiple of {name}.policy_delay={team.policy_delay} (nor divides it)",

@@ -53,11 +53,11 @@ class _Check:
             if not isinstance(value, tuple) or len(value) != len(agents):
                 size = f"{len(value)} entries" if isinstance(value, tuple) else f"a {type(value).__name__}"
                 self.fail(f"{field} has {size}; must be a tuple with one for each of the {len(agents)} agents")
-        for agent, team, size in zip(agents, env.teams, env.observation_sizes, strict=True):
+        for agent, team, entries in zip(agents, env.teams, env.observation_sizes, strict=True):
             if team not in TEAMS:
                 self.fail(f"the team of {agent!r} is {team!r}; must be one of {', '.join(map(repr, TEAMS))}")
-            if not _whole(size, 1):
-                self.fail(f"the observation size of {agent!r} is {size!r}; must be a whole number of at least 1")
+            if not _whole(entries, 1):
+                self.fail(f"the observation size of {agent!r} is {entries!r}; must be a whole number of at least 1")
         for agent, space in zip(agents, env.action_spaces, strict=True):
             self.space(agent, space)
         if not _whole(env.episode_length, 1):
@@ -140,7 +140,8 @@ class _Check:
 
     def same_state(self, before: Any, after: Any) -> None:
         """A state that changes its form cannot be carried through a loop."""
-        old, new = jax.tree.structure(before), jax.tree.structure(after)
+        old: Any = jax.tree.structure(before)
+        new: Any = jax.tree.structure(after)
         if old != new:
             self.fail(f"step returns a state of another structure than reset: {new}; must be {old}")
         leaves = zip(jax.tree_util.tree_leaves_with_path(before), jax.tree.leaves(after), strict=True)
