@@ -19,7 +19,7 @@ from matd3_jax.config.coerce import plain, typed
 from matd3_jax.config.validate import check
 from matd3_jax.core.algorithm import Algorithm, HyperParams
 from matd3_jax.errors import OptionError, UserError, nearest
-from matd3_jax.runtime import slurm
+from matd3_jax.runtime import files, slurm
 
 ADDED_TO_ALGO = {
     "actor_output": "sigmoid",
@@ -317,7 +317,7 @@ def text(config: Config) -> str:
 
 def write(config: Config, path: Path) -> None:
     """Leave every resolved value in a YAML file."""
-    path.write_text(text(config))
+    files.write_text(path, text(config))
 
 
 def from_dict(values: Mapping[str, Any]) -> Config:
