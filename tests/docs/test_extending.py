@@ -29,7 +29,11 @@ LEARNED = ("agent_0_critic_loss", "agent_0_q_value", "agent_0_actor_loss", "retu
 
 def edits(section):
     """The blocks of a section that edit the package: diffs, and files that begin with their name."""
-    return [b for b in BLOCKS if b.section == section and (b.language == "diff" or b.code.startswith("# core/"))]
+    return [
+        b
+        for b in BLOCKS
+        if b.section == section and (b.language == "diff" or b.code.startswith(("# core/", "# config/")))
+    ]
 
 
 def package(folder, sections):
@@ -100,7 +104,8 @@ def test_loss_and_its_setting(tmp_path, plain):
 
 def test_critic_head(tmp_path, plain):
     """Before the first update nothing differs; then losses do, as errors beyond 1 count linearly."""
-    huber = train(package(tmp_path, ["A critic head"]))[0]
+    usual, huber = train(package(tmp_path, ["A critic head"]), "algo=matd3", "algo=matd3_huber")
+    assert same(usual, plain)
     assert np.array_equal(huber["return_agents"][:, 0], plain["return_agents"][:, 0])
     assert (huber["agent_0_critic_loss"][:, -1] < plain["agent_0_critic_loss"][:, -1]).all()
 
