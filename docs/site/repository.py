@@ -16,7 +16,6 @@ from mkdocs.structure.pages import Page
 ROOT = Path(__file__).parents[2]
 HOME = "README.md"
 LINK = re.compile(r"(?<=\]\()(?![a-z]+:|#|/)([^)\s#]+)(#[^)\s]*)?(?=\))")
-TEXT = (".md", ".csv", ".json", ".png", ".gif", ".cff")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
