@@ -2,7 +2,7 @@
 
     python -m benchmarks.gpu out=DIR [parts=[check,...]] [minutes=60] [scale=1.0]
 
-Parts, in this order; docs/performance.md says what each takes:
+Parts, in this order; docs/performance_notes.md says what each takes:
     check       one update against the CPU's, single Ant steps against C MuJoCo, no copy of the replay in the loop
     wall_clock  20 seeds x 60,000 episodes of simple_spread, and their returns beside the CPU's
     floor       the least time of an iteration: its products and bytes at the device's own rates

@@ -9,8 +9,6 @@ from matd3_jax.runs.directory import RunDirectory
 ROWS = [
     {"step": np.array([s, s]), "seed": np.array([0, 1]), "q": np.array([s / 3, -1e-7 * s])} for s in (650, 6500, 7000)
 ]
-    {"step": np.array([s, s]), "seed": np.array([0, 1]), "q": np.array([s / 3, -1e-7 * s])} for s in (650, 6500, 7000)
-]
 WHOLE = "".join(metrics_table.row_lines(row, header=k == 0) for k, row in enumerate(ROWS)).encode()
 LINES = WHOLE.splitlines(keepends=True)
 
