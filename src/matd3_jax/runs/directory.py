@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shlex
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from matd3_jax import config as configuration
 from matd3_jax.config import Config
 from matd3_jax.config.diff import differing, learning, text
 from matd3_jax.errors import UserError
+from matd3_jax.runs.paths import check_new_directory
 
 
 class RunDirectory:
@@ -30,13 +32,20 @@ class RunDirectory:
         self.q_bias = path / "q_bias.png"
         self.tensorboard = path / "tensorboard"
 
+    @staticmethod
+    def check_new(path: Path) -> None:
+        """Raise UserError where `create` could not make the directory. Makes nothing."""
+        if path.exists():
+            raise UserError(_there(path))
+        check_new_directory(path, "run directory")
+
     @classmethod
     def create(cls, path: Path, config: Config, machine: Mapping[str, Any]) -> "RunDirectory":
         """Make the directory. Raises UserError if it is there already or cannot be made."""
         try:
             path.mkdir(parents=True)
         except FileExistsError:
-            raise UserError(f"{path} is there already: choose another name=, or go on with resume={path}") from None
+            raise UserError(_there(path)) from None
         except OSError as error:
             raise UserError(f"cannot make the run directory {path}: {error.strerror}") from error
         run = cls(path)
@@ -97,11 +106,15 @@ class RunDirectory:
         (self.path / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
 
 
+def _there(path: Path) -> str:
+    return f"{path} is there already: choose another name=, or go on with {shlex.quote(f'resume={path}')}"
+
+
 def together(paths: Sequence[Path]) -> dict[str, np.ndarray]:
     """The metrics of runs that differ only in their seeds, as one table: columns [rows], by env step, then by seed.
 
     Columns that only some of the runs have (evaluations, say) are left out. How long runs go and what they leave behind
-    (`diff.RECORDS`) may differ, too: then not every seed has every step.
+    (`schema.RECORDS`) may differ, too: then not every seed has every step.
 
     Raises UserError where there is no run or no metrics yet, where runs differ otherwise, or two have the same seed.
     """
