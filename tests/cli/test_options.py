@@ -1,6 +1,7 @@
 """Options of commands: how they are read, what is refused, what the help says of them."""
 
 import dataclasses
+import glob
 import math
 import shlex
 import subprocess
@@ -9,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from matd3_jax.cli import arguments, command, options
+from matd3_jax.bounds import Bounds
+from matd3_jax.cli import arguments, command
 from matd3_jax.cli.options import Command, flag, option, others
 from matd3_jax.errors import UserError
 from matd3_jax.figures import learning_curves
@@ -93,8 +95,9 @@ def test_values_have_the_type_of_their_field(argument, name, value):
 
 
 NASTY = (
-    "1e3", "true", "null", "None", "007", "a b", "a=b", "a,b", "[a]", "[a,b]", "{a:b}", "it's", '"quoted"', "naïve ü 日本", "$HOME",
-    "${x}", "${", "a\\b", "x: y #z", "~/a", "*", "--quick", "  spaces ", "interval(1,2)", "choice(a,b)", "a;b&c|d",
+    "1e3", "true", "null", "None", "007", "a b", "a=b", "a,b", "[a]", "[a,b]", "{a:b}", "it's", '"quoted"',
+    "naïve ü 日本", "$HOME", "${x}", "${", "a\\b", "x: y #z", "~/a", "*", "--quick", "  spaces ", "interval(1,2)",
+    "choice(a,b)", "a;b&c|d",
 )  # fmt: skip
 
 
@@ -113,7 +116,8 @@ def test_our_commands_take_any_name_of_a_run(text):
     assert (sweep.name, sweep.out, sweep.resume) == (text, Path(text), Path(text))
     assert arguments.PLOT.parse(["runs=a", f"title={text}"]).title == text
     quoted = f'"{text}"' if '"' not in text else f"'{text}'"
-    assert arguments.CROSSPLAY.parse([f"runs=a,{quoted}"]).runs[1] == Path(text.strip()).expanduser()
+    if not glob.has_magic(text):  # which names the directories that match
+        assert arguments.CROSSPLAY.parse([f"runs=a,{quoted}"]).runs[1] == Path(text.strip()).expanduser()
 
 
 @pytest.mark.parametrize(
@@ -139,17 +143,13 @@ def test_our_commands_take_any_name_of_a_run(text):
         ("names=a,c", "names=a,c: must be one of a, b; known: a, b"),
         ("file=no/such/file", "file=no/such/file: there is no directory no/such"),
         ("file=", "file=: must name a file"),
-        ("cuont=3", "there is no key 'cuont'; did you mean 'count'?"),
+        ("cuont=3", "there is no key 'cuont'; did you mean 'count' or 'on'?"),
         ("--quik", "there is no option '--quik'; did you mean '--quick'?"),
         ("count", "cannot read 'count': write key=value"),
         ("where=there", "where= is given 2 times: here, there"),
-        ("text='a", None),
     ],
 )
 def test_mistakes_are_one_line(argument, message):
-    if message is None:
-        parse(argument)
-        return
     with pytest.raises(UserError) as error:
         parse(argument)
     assert str(error.value) == message
@@ -199,7 +199,7 @@ def test_help_has_an_aligned_line_for_each_option():
     column = lines[first].index("a directory")
     found = {line[:column].strip(): line[column:] for line in lines[first : lines.index("", first)]}
     assert {left: found[left] for left in wanted} == wanted
-    assert list(found)[0] == "where=PLACE" and list(found)[-2].startswith("shared=")
+    assert list(found)[0] == "where=PLACE" and list(found)[-4:] == ["shared=N", "--quick", "inner.KEY=VALUE", "--help"]
     assert "More text." in lines and lines[-1] == "  do where=here count=2"
 
 
@@ -209,12 +209,13 @@ def test_help_of_our_commands_lists_every_option(name, capsys):
     printed = capsys.readouterr().out
     fields = dataclasses.fields(arguments.COMMANDS[name].options)
     for field in fields:
-        left = f"  {field.metadata.get('flag') or field.metadata.get('others', field.name)}"
-        line = next(line for line in printed.splitlines() if line.startswith(left))
-        assert field.metadata["help"][:20] in line, line
+        meta = field.metadata
+        left = meta.get("flag") or (f"{meta['others']}KEY=" if "others" in meta else f"{field.name}=")
+        line = next(line for line in printed.splitlines() if line.startswith(f"  {left}"))
+        assert meta["help"][:20] in line, line
     assert all(line.startswith("  python -m matd3_jax.") for line in printed.split("examples:\n")[1].splitlines())
     for example in printed.split("examples:\n")[1].splitlines():
-        arguments.COMMANDS[name].parse(shlex.split(example)[3:])
+        arguments.COMMANDS[name].parse([word.replace("*", "1") for word in shlex.split(example)[3:]])
 
 
 @pytest.mark.parametrize("name", arguments.COMMANDS)
@@ -272,6 +273,5 @@ def test_a_directory_is_checked_without_being_made(tmp_path, monkeypatch):
 
 
 def test_numbers_must_be_finite():
-    assert options.option("x").metadata["bounds"].admits(3) and not options.option("x").metadata["bounds"].admits(
-        math.inf
-    )
+    bounds = Bounds(least=0)
+    assert bounds.admits(3) and not bounds.admits(math.inf) and not bounds.admits(math.nan)

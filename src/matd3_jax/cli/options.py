@@ -224,16 +224,14 @@ def _convert(name: str, text: str, kind: Any, meta: typing.Mapping[str, Any], wh
 def _number(text: str, kind: type) -> Any:
     """The number that a text is; None if it is none."""
     try:
-        return int(text)
+        return kind(text)
     except ValueError:
         pass
     try:
-        value = float(text)
+        value = float(text)  # 1e6 reads better than 1000000
     except ValueError:
         return None
-    if kind is float:
-        return value
-    return int(value) if math.isfinite(value) and value.is_integer() else None  # 1e6 reads better than 1000000
+    return int(value) if math.isfinite(value) and value.is_integer() else None
 
 
 def _kinds(hint: Any) -> list[Any]:
