@@ -10,6 +10,7 @@ from study_cases import NOISE, fake_run, verdicts
 
 from experiments import all as everything
 from experiments import ant, collecting, competitive, cooperative, grid_search, study, target_smoothing, tidy
+from experiments.study import StudyOptions
 from matd3_jax import config
 from matd3_jax.errors import UserError
 from matd3_jax.runs.directory import RunDirectory
@@ -29,7 +30,8 @@ def test_competitive_from_run_directories(tmp_path):
         columns = {"return_agents": (NOISE, ours), "return_adversaries": (NOISE, 0 * NOISE - 50)}
         if env == "simple_tag":
             columns = {"return_adversaries": (NOISE, ours), "return_agents": (NOISE, 0 * NOISE - 50)}
-        overrides = [*competitive.settings("paper", {})[f"{env}-{algo}-vs-{adversary}"][:3], "log_every=7000"]
+        line = competitive.settings("paper", StudyOptions())[f"{env}-{algo}-vs-{adversary}"]
+        overrides = [*line[:3], "log_every=7000"]
         if algo == adversary == "matd3":  # the same without a word
             overrides = overrides[:2] + overrides[3:]
         fake_run(tmp_path / "runs" / f"{env}-{algo}-vs-{adversary}", [*overrides, "eval_every=0"], columns)
@@ -67,7 +69,7 @@ def trained(monkeypatch):
 
 def test_finished_data_are_used_and_only_what_is_missing_is_trained(tmp_path, trained):
     runs, out = tmp_path / "runs", tmp_path / "out"
-    for label, line in target_smoothing.settings("small", {}).items():
+    for label, line in target_smoothing.settings("small", StudyOptions()).items():
         if label != "sigma0.4":
             fake_run(runs / label, [t for t in line if "seeds" not in t], {"return_agents": (NOISE, 10 + NOISE)})
     argv = ["scale=small", f"runs={runs}", f"out={out}"]
@@ -88,7 +90,7 @@ def test_finished_data_are_used_and_only_what_is_missing_is_trained(tmp_path, tr
 
 def test_unfinished_runs_are_drawn_but_claim_nothing(tmp_path):
     runs, out = tmp_path / "runs", tmp_path / "out"
-    for label, line in cooperative.settings("paper", {}).items():
+    for label, line in cooperative.settings("paper", StudyOptions()).items():
         returns = {"return_agents": (NOISE, 10 + NOISE)}
         fake_run(runs / label, [t for t in line if "seeds" not in t], returns, finished=label != "simple_spread-matd3")
     claims = study.run(cooperative.STUDY, ["train=false", f"runs={runs}", f"out={out}"])
@@ -98,7 +100,7 @@ def test_unfinished_runs_are_drawn_but_claim_nothing(tmp_path):
 
 
 def test_seeds_of_several_directories_are_one_setting(tmp_path):
-    line = [t for t in cooperative.settings("paper", {})["simple_spread-matd3"] if "seeds" not in t]
+    line = [t for t in cooperative.settings("paper", StudyOptions())["simple_spread-matd3"] if "seeds" not in t]
     fake_run(tmp_path / "part0", line, {"return_agents": (NOISE, NOISE)})
     fake_run(tmp_path / "part1", [*line, "seed=4"], {"return_agents": (NOISE, NOISE)})
     path = tmp_path / "part1" / "metrics.csv"
@@ -120,7 +122,7 @@ def test_seeds_of_several_directories_are_one_setting(tmp_path):
 
 def test_all_makes_one_summary(tmp_path, monkeypatch):
     monkeypatch.setattr(everything, "STUDIES", {s.STUDY.name: s.STUDY for s in (cooperative, target_smoothing, ant)})
-    for label, line in target_smoothing.settings("paper", {}).items():
+    for label, line in target_smoothing.settings("paper", StudyOptions()).items():
         returns = {"return_agents": (0 * NOISE, 10 + 0.1 * NOISE)}
         fake_run(tmp_path / "runs" / "target_smoothing" / label, [t for t in line if "seeds" not in t], returns)
     argv = ["train=false", "skip=[ant]", f"runs={tmp_path / 'runs'}", f"out={tmp_path / 'out'}"]
@@ -135,7 +137,7 @@ def test_all_makes_one_summary(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("argv", "line"),
     [
-        (["scale=large"], "scale=large: must be paper or small"),
+        (["scale=large"], "scale=large: must be one of paper, small"),
         (["train=maybe"], "train=maybe: must be true or false"),
         (["seeds=0"], "seeds=0: must be a whole number of at least 1"),
         (["only=x*"], "only=x\\*: matches none of simple_spread-matd3, simple_spread-maddpg"),
@@ -152,7 +154,7 @@ def test_bad_input_is_one_line(tmp_path, argv, line):
 
 
 def test_runs_with_other_settings_are_refused(tmp_path):
-    line = [t for t in cooperative.settings("paper", {})["simple_spread-matd3"] if "seeds" not in t]
+    line = [t for t in cooperative.settings("paper", StudyOptions())["simple_spread-matd3"] if "seeds" not in t]
     fake_run(tmp_path / "runs" / "simple_spread-matd3", [*line, "algo.lr=0.003"], {"return_agents": (NOISE, NOISE)})
     with pytest.raises(UserError, match="other settings .*algo.actor_lr 0.003 there, 0.01 here.*remove it, or choose"):
         cooperative.main([f"runs={tmp_path}", f"out={tmp_path / 'out'}"])

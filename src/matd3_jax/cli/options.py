@@ -87,7 +87,8 @@ class Command(Generic[Options]):
 
     Attributes:
         program: for instance `python -m matd3_jax.evaluate`.
-        options: a dataclass whose fields are made by `option`, `flag` and `others`; its docstring begins the help.
+        options: a dataclass whose fields are made by `option`, `flag` and `others`.
+        about: how the help begins; default: the docstring of the dataclass.
         usage: what may follow the program, one line each; default: the required options and `[key=value ...]`.
         examples: whole command lines.
         more: text between options and examples, or what makes it.
@@ -95,6 +96,7 @@ class Command(Generic[Options]):
 
     program: str
     options: type[Options]
+    about: str | None = None
     usage: Sequence[str] = ()
     examples: Sequence[str] = ()
     more: str | Callable[[], str] = ""
@@ -142,7 +144,7 @@ class Command(Generic[Options]):
         needed = [f"{f.name}={_metavar(hints[f.name], f.metadata)}" for f in required]
         usage = self.usage or [" ".join([*needed, "[key=value ...]"])]
         lines = [f"{'usage:' if k == 0 else '':<6} {self.program} {line}".rstrip() for k, line in enumerate(usage)]
-        lines += ["", inspect.cleandoc(self.options.__doc__ or ""), "", "options:"]
+        lines += ["", inspect.cleandoc(self.about or self.options.__doc__ or ""), "", "options:"]
         rows = [(f"{f.name}={_metavar(hints[f.name], f.metadata)}", _meaning(f, hints[f.name])) for f in plain]
         for f in fields:
             if "flag" in f.metadata:
@@ -263,7 +265,8 @@ def _meaning(field: dataclasses.Field, hint: Any) -> str:
     if meta["unit"]:
         notes.append(meta["unit"])
     if bounds.choices is not None:
-        notes += [f"of {', '.join(map(str, bounds.choices))}"] if several or meta["metavar"] else []
+        named = not (several or meta["metavar"]) or field.default == bounds.choices
+        notes += [] if named else [f"of {', '.join(map(str, bounds.choices))}"]
     elif bounds.most is not None:
         notes.append(f"at most {bounds.most}" if bounds.least is None else f"{bounds.least} to {bounds.most}")
     elif bounds.above is not None:

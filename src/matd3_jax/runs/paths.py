@@ -28,16 +28,20 @@ def paths(texts: Sequence[str], key: str = "runs") -> tuple[Path, ...]:
 
 
 def check_new_directory(path: Path, key: str) -> None:
-    """Raise UserError where `path` cannot be made as a new directory, or holds something already. Makes nothing.
+    """`check_directory`, and raise UserError where something is in it already."""
+    check_directory(path, key)
+    if path.is_dir() and any(path.iterdir()):
+        raise UserError(f"{key}={path}: something is there already; choose another directory")
+
+
+def check_directory(path: Path, key: str) -> None:
+    """Raise UserError where nothing can be written into the directory `path`, which need not be there. Makes nothing.
 
     Args:
         key: of the option that names it, for the message.
     """
     try:
-        if path.is_dir():
-            if any(path.iterdir()):
-                raise UserError(f"{key}={path}: something is there already; choose another directory")
-        elif path.exists():
+        if path.exists() and not path.is_dir():
             raise UserError(f"{key}={path}: cannot make this directory: a file has this name")
         above = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
     except OSError as error:
