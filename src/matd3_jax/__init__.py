@@ -22,9 +22,11 @@ _MODULES = {
 """Imported when they are first asked for: a command's --help and what needs no JAX do not wait for it."""
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = importlib.import_module(f"{__name__}.{_MODULES[name]}")
-    globals()[name] = found = module if name == "envs" else getattr(module, name)
-    return found
+if not TYPE_CHECKING:  # or any name would pass
+
+    def __getattr__(name: str) -> Any:
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        module = importlib.import_module(f"{__name__}.{_MODULES[name]}")
+        globals()[name] = found = module if name == "envs" else getattr(module, name)
+        return found

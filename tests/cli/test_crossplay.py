@@ -148,6 +148,16 @@ def test_bad_input_writes_nothing(case, saved, tmp_path, monkeypatch):
     assert before == {p: p.stat().st_mtime_ns for p in saved.rglob("*")} and not list(tmp_path.iterdir())
 
 
+def test_what_fails_while_playing_leaves_no_directory(saved, tmp_path, monkeypatch):
+    def fail(*_):
+        raise MemoryError
+
+    monkeypatch.setattr(crossplay.cross_play, "play", fail)
+    with pytest.raises(MemoryError):
+        crossplay.main([f"runs={saved}/normal", "episodes=2", f"out={tmp_path}/new/place"])
+    assert not list(tmp_path.iterdir())
+
+
 def test_paths(tmp_path, monkeypatch):
     """Names as they are, whatever Hydra would make of them; several runs=; wildcards match run directories only."""
     monkeypatch.chdir(tmp_path)

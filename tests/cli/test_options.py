@@ -264,6 +264,7 @@ def test_a_directory_is_checked_without_being_made(tmp_path, monkeypatch):
         ("full/file", "cannot make this directory: a file has this name"),
         ("full/file/a", "cannot make this directory"),
         ("a" * 300, "cannot make this directory: File name too long"),
+        (f"new/{'a' * 300}/b", "cannot make this directory: File name too long"),
     ):
         with pytest.raises(UserError, match=f"out=.*{message}"):
             check_new_directory(tmp_path / path, "out")

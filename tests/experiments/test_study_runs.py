@@ -1,7 +1,9 @@
 """The experiments' commands: from run directories to reports, reuse of data, training, errors."""
 
 import csv
+import dataclasses
 import json
+import shlex
 import shutil
 
 import numpy as np
@@ -9,7 +11,17 @@ import pytest
 from study_cases import NOISE, fake_run, verdicts
 
 from experiments import all as everything
-from experiments import ant, collecting, competitive, cooperative, grid_search, study, target_smoothing, tidy
+from experiments import (
+    ant,
+    collecting,
+    competitive,
+    cooperative,
+    cooperative_navigation,
+    grid_search,
+    study,
+    target_smoothing,
+    tidy,
+)
 from experiments.study import StudyOptions
 from matd3_jax import config
 from matd3_jax.errors import UserError
@@ -151,6 +163,46 @@ def test_bad_input_is_one_line(tmp_path, argv, line):
     with pytest.raises(UserError, match=line):
         cooperative.main([*argv, f"runs={tmp_path / 'runs'}", f"out={tmp_path / 'out'}"])
     assert not (tmp_path / "runs").exists() and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("key", ["runs", "out"])
+def test_directories_are_checked_before_anything_is_trained(tmp_path, trained, key):
+    (tmp_path / "file").touch()
+    places = {"runs": tmp_path / "runs", "out": tmp_path / "out", key: tmp_path / "file"}
+    with pytest.raises(UserError, match=f"{key}=.*/file: cannot make this directory"):
+        cooperative.main(["scale=small", *(f"{name}={path}" for name, path in places.items())])
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_comparison_that_cannot_be_trained_leaves_no_directory(tmp_path):
+    with pytest.raises(UserError, match="no key 'sedes'"):
+        cooperative_navigation.main(["sedes=3", f"out={tmp_path / 'out'}"])
+    assert not list(tmp_path.iterdir())
+
+
+def test_all_options_are_checked_before_the_first_experiment(tmp_path, trained):
+    """A mistake in what all of them share is found before the first of them begins."""
+    with pytest.raises(UserError, match="scale=smal: must be one of paper, small"):
+        everything.main(["scale=smal", f"out={tmp_path / 'out'}", f"runs={tmp_path / 'runs'}"])
+    assert not list(tmp_path.iterdir())
+
+
+def test_recorded_commands_can_be_pasted(tmp_path):
+    """But for where files lay; a pattern is quoted for the shell."""
+    runs, out = tmp_path / "runs", tmp_path / "out"
+    for label, line in cooperative.settings("paper", StudyOptions()).items():
+        fake_run(runs / label, [t for t in line if "seeds" not in t], {"return_agents": (NOISE, 10 + NOISE)})
+    assert cooperative.main(["train=false", "only=*maddpg* of 'mine'", f"runs={runs}", f"out={out}"]) == 0
+    (told,) = {fact["command"] for fact in json.loads((out / "runs.json").read_text()).values()}
+    assert shlex.split(told) == ["python", "-m", "experiments.cooperative", "only=*maddpg* of 'mine'"]
+
+
+@pytest.mark.parametrize("module", [ant, cooperative, grid_search])
+def test_help_lists_every_option(module, capsys):
+    assert module.main(["--help"]) == 0
+    printed = capsys.readouterr().out
+    names = [field.name for field in dataclasses.fields(module.STUDY.options) if "bounds" in field.metadata]
+    assert all(f"\n  {name}=" in printed for name in names) and str(module.__doc__).splitlines()[-1] in printed
 
 
 def test_runs_with_other_settings_are_refused(tmp_path):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import shlex
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ from matd3_jax.cli.arguments import Sweep as SweepOptions
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError, nearest
 from matd3_jax.figures import sweep as sweep_figure
-from matd3_jax.runs.paths import check_new_directory
+from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import devices, multihost, slurm
 from matd3_jax.runtime.multihost import ALONE, Processes
 from matd3_jax.sweep import batching, launcher, ranking, search_space
@@ -80,10 +79,7 @@ def _plan(
     folder: Path, facts: Mapping[str, Any], settings: Mapping[str, Config], memory: float | None, processes: Processes
 ) -> None:
     """Make the sweep's directory, and say what is in it."""
-    if folder.exists():
-        again = shlex.quote(f"resume={folder}")
-        raise UserError(f"{folder} is there already: choose another name=, or go on with {again}")
-    check_new_directory(folder, "sweep directory")
+    RunDirectory.check_new(folder)
     sweep = Sweep(folder, processes)
     runs = sweep.add(settings, None if memory is None else int(memory * 1e9))
     facts = {**facts, "runs": {name: [path.name for path in paths] for name, paths in runs.items()}}

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import shlex
 import shutil
 from collections.abc import Mapping, Sequence
@@ -14,7 +15,7 @@ from matd3_jax import config as configuration
 from matd3_jax.config import Config
 from matd3_jax.config.diff import differing, learning, text
 from matd3_jax.errors import UserError
-from matd3_jax.runs.paths import check_new_directory
+from matd3_jax.runs.paths import check_directory
 
 
 class RunDirectory:
@@ -34,10 +35,12 @@ class RunDirectory:
 
     @staticmethod
     def check_new(path: Path) -> None:
-        """Raise UserError where `create` could not make the directory. Makes nothing."""
+        """Raise UserError where no directory for a run, or a sweep, can be made anew. Makes nothing."""
+        check_directory(path, "directory")
+        if "\\" in str(path.absolute()) and os.sep == "/":  # which Orbax would take for a slash
+            raise UserError(f"{str(path.absolute())!r}: checkpoints cannot be kept where a path has a backslash")
         if path.exists():
             raise UserError(_there(path))
-        check_new_directory(path, "run directory")
 
     @classmethod
     def create(cls, path: Path, config: Config, machine: Mapping[str, Any]) -> "RunDirectory":

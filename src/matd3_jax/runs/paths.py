@@ -1,5 +1,6 @@
 """Directories named on the command line: those of runs, `runs=A,B,C`, and those that a command is going to make."""
 
+import errno
 import glob
 import os
 from collections.abc import Sequence
@@ -44,6 +45,9 @@ def check_directory(path: Path, key: str) -> None:
         if path.exists() and not path.is_dir():
             raise UserError(f"{key}={path}: cannot make this directory: a file has this name")
         above = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
+        longest = os.pathconf(above, "PC_NAME_MAX") if hasattr(os, "pathconf") else 255
+        if any(len(os.fsencode(name)) > longest for name in path.absolute().relative_to(above).parts):
+            raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
     except OSError as error:
         raise UserError(f"{key}={path}: cannot make this directory: {error.strerror}") from error
     if not above.is_dir():
