@@ -101,6 +101,12 @@ class Command(Generic[Options]):
     examples: Sequence[str] = ()
     more: str | Callable[[], str] = ""
 
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Those of its options that are written `key=value`."""
+        fields = dataclasses.fields(self.options)  # type: ignore[arg-type]
+        return tuple(field.name for field in fields if "bounds" in field.metadata)
+
     def parse(self, argv: Sequence[str]) -> Options:
         """The options that the arguments give. Raises UserError, in one line, for the first that will not do."""
         hints = typing.get_type_hints(self.options)

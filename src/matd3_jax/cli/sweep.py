@@ -1,6 +1,5 @@
 """`python -m matd3_jax.sweep algo.lr=0.01,0.003 seeds=4`: train all combinations, or random draws, and rank them."""
 
-import dataclasses
 import json
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,8 +19,6 @@ from matd3_jax.sweep import batching, launcher, ranking, search_space
 from matd3_jax.sweep.runner import Sweep
 from matd3_jax.sweep.search_space import SearchSpace
 from matd3_jax.training.session import TrainingSession
-
-OWN = tuple(field.name for field in dataclasses.fields(SweepOptions))
 
 METRIC = "return_agents"
 """By which settings are ranked."""
@@ -90,8 +87,9 @@ def _plan(
 
 def check_metric(settings: Iterable[Config], metric: str) -> None:
     """Raise UserError where the metrics table of one of the settings will have no such column."""
-    for config_ in {batching.program(one): one for one in settings}.values():
-        columns = TrainingSession(config_).columns
+    programs = {batching.program(one): one for one in settings}
+    for one in programs.values():
+        columns = TrainingSession(one).columns
         if metric not in columns:
             raise UserError(f"metric={metric}: the metrics table has no such column; {nearest(metric, columns)}")
 
@@ -104,7 +102,9 @@ def read(overrides: Sequence[str], samples: int | None, seed: int) -> tuple[list
     settings = {}
     for name, values in zip(search_space.names(space.axes, chosen), chosen, strict=True):
         try:
-            settings[name or "run"] = config.load([*space.fixed, *(f"{k}={v}" for k, v in values.items())], OWN)
+            settings[name or "run"] = config.load(
+                [*space.fixed, *(f"{k}={v}" for k, v in values.items())], arguments.SWEEP.keys
+            )
         except UserError as error:
             swept = ", ".join(f"{key}={value}" for key, value in values.items())
             raise UserError(f"{error} (with {swept})" if values else str(error)) from error

@@ -1,6 +1,5 @@
 """`python -m matd3_jax.train env=simple_spread algo=matd3 seeds=4`: train, and leave a run directory."""
 
-import dataclasses
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -31,9 +30,8 @@ ENGINES = {"c": "C MuJoCo", "mjx": "MuJoCo in JAX", "mjx_fast": "MuJoCo in JAX w
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit code."""
     given = arguments.TRAIN.parse(argv)
-    own = [field.name for field in dataclasses.fields(given)]
     if given.cfg:
-        print(config.text(config.load(given.settings, own)), end="")
+        print(config.text(config.load(given.settings, arguments.TRAIN.keys)), end="")
         return 0
     devices.prepare()
     with multihost.start(given.processes()) as processes:
@@ -42,7 +40,7 @@ def main(argv: Sequence[str]) -> int:
             return resume(given.resume, given.checkpoint, given.settings, processes)
         if given.checkpoint is not None:
             raise UserError("checkpoint= goes with resume=RUN_DIR")
-        return start(config.load(given.settings, own), processes)
+        return start(config.load(given.settings, arguments.TRAIN.keys), processes)
 
 
 def start(settings: Config, processes: Processes) -> int:
