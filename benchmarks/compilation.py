@@ -1,4 +1,4 @@
-"""`python -m benchmarks.compilation env=NAME [key=value ...]`: how long train's programs take to compile, as JSON.
+"""`python -m benchmarks.compilation`: how long train's programs take to compile, as JSON.
 
 The programs of `python -m matd3_jax.train` with these settings, in the order in which it needs them: start (networks,
 environments and an empty replay, run once), warm-up, evaluation, interval. Of each: seconds to trace it, to lower it to
@@ -7,6 +7,7 @@ replay has `learning_starts` rows, their number does not change the work; nothin
 `benchmarks.compile_times` calls this once for each environment and state of the cache.
 """
 
+import dataclasses
 import json
 import sys
 import time
@@ -20,6 +21,7 @@ import jax  # noqa: E402
 
 from matd3_jax import config  # noqa: E402
 from matd3_jax.cli import command  # noqa: E402
+from matd3_jax.cli.options import Command, others  # noqa: E402
 from matd3_jax.runtime import devices  # noqa: E402
 from matd3_jax.training.session import TrainingSession  # noqa: E402
 
@@ -30,10 +32,21 @@ EVENTS = {
 }
 
 
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of this benchmark."""
+
+    overrides: tuple[str, ...] = others("a setting of the run, as matd3_jax.train takes it")
+
+
+COMMAND = Command("python -m benchmarks.compilation", Options, __doc__, usage=("env=NAME [key=value ...]",))
+
+
 def main(argv: Sequence[str]) -> int:
+    overrides = COMMAND.parse(argv).overrides
     devices.prepare()
-    settings = config.load(argv)
-    settings = config.load([f"replay_capacity={settings.learning_starts}", *argv])
+    settings = config.load(overrides)
+    settings = config.load([f"replay_capacity={settings.learning_starts}", *overrides])
     imported = time.perf_counter() - BEGUN
     programs = {}
     begun = time.perf_counter(), time.process_time()
@@ -82,4 +95,4 @@ def _passed(begun: tuple[float, float]) -> dict[str, float]:
 
 if __name__ == "__main__":
     sys.argv[0] = "compilation"
-    command.run(main)
+    command.run(main, COMMAND)

@@ -1,8 +1,5 @@
 """`python -m benchmarks.compile_times`: how long train's programs take to compile for each environment, cold and warm.
 
-    python -m benchmarks.compile_times [envs=[simple_spread,ant]] [repeats=1] [at_once=1] [out=FILE.json]
-                                       [key=value ...]
-
 Default: every environment that has settings. For each a fresh process with an empty compilation cache and another one
 with the cache that the first has filled (`benchmarks.compilation`); medians of `repeats` such pairs. `at_once`: so many
 environments side by side, each on its share of the cores alone. Other keys are settings of the run. Told are, for each
@@ -10,13 +7,12 @@ program, wall-clock seconds (of which tracing and lowering, done in Python) and 
 machine changes less; cold programs of more than 30 s of a core are marked.
 """
 
-import json
+import dataclasses
 import os
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from queue import Queue
 from typing import Any
 
@@ -24,21 +20,33 @@ import numpy as np
 
 from benchmarks import fresh
 from benchmarks.commit import commit
+from benchmarks.options import OfARun
 from matd3_jax import config
 from matd3_jax.cli import command
-from matd3_jax.errors import UserError, nearest
+from matd3_jax.cli.options import Command, option
+from matd3_jax.errors import UserError
 from matd3_jax.runtime import devices
 
-DEFAULTS: dict[str, Any] = {"envs": None, "repeats": 1, "at_once": 1, "out": None}
+
+@dataclasses.dataclass(frozen=True)
+class Options(OfARun):
+    """Options of this benchmark."""
+
+    envs: tuple[str, ...] = option(
+        "environments", default=config.known_names("env"), choices=config.known_names("env"), metavar="[NAME,NAME,...]"
+    )
+    repeats: int = option("pairs of processes, cold and warm, of each environment", default=1, least=1)
+    at_once: int = option("environments side by side, each on its share of the cores", default=1, least=1)
+
+
+COMMAND = Command("python -m benchmarks.compile_times", Options, __doc__)
 PROGRAMS = ("start", "warm-up", "evaluation", "interval")
 LIMIT = 30.0
 """Seconds of a core for one program, cold: more is a defect to look into."""
 
 
 def main(argv: Sequence[str]) -> int:
-    taken, overrides = config.take(argv, tuple(DEFAULTS))
-    options = {**DEFAULTS, **taken}
-    envs = _check(options)
+    options = COMMAND.parse(argv)
     report: dict[str, Any] = {
         "versions": devices.versions(),
         "commit": commit(),
@@ -49,7 +57,7 @@ def main(argv: Sequence[str]) -> int:
     print(f"{'environment':<24} {'cache':<5} {'import':>7} " + " ".join(f"{name:>14}" for name in PROGRAMS)
           + f" {'all':>14}  of it traced and lowered", flush=True)  # fmt: skip
     shares: Queue[set[int] | None] = Queue()
-    for share in cores(options["at_once"]):
+    for share in cores(options.at_once):
         shares.put(share)
 
     def one(env: str) -> tuple[str, dict[str, Any]]:
@@ -57,19 +65,18 @@ def main(argv: Sequence[str]) -> int:
         try:
             if share is not None:
                 os.sched_setaffinity(0, share)  # of this thread, and of the processes that it starts
-            return env, measure([f"env={env}", *overrides], options["repeats"])
+            return env, measure([f"env={env}", *options.overrides], options.repeats)
         finally:
             shares.put(share)
 
-    with ThreadPoolExecutor(options["at_once"]) as pool:
-        for env, found in pool.map(one, envs):
+    with ThreadPoolExecutor(options.at_once) as pool:
+        for env, found in pool.map(one, options.envs):
             report.setdefault("machine", found.pop("machine"))
             found.pop("machine", None)
             report["environments"][env] = found
             for state in ("cold", "warm"):
                 print(row(env, state, found[state]), flush=True)
-            if options["out"] is not None:
-                Path(str(options["out"])).write_text(json.dumps(report, indent=1) + "\n")
+            options.write(report)
     for line in slow(report["environments"]):
         print(line)
     return 0
@@ -122,23 +129,6 @@ def cores(at_once: int) -> list[set[int] | None]:
     return [set(there[k::at_once]) for k in range(at_once)]
 
 
-def _check(options: Mapping[str, Any]) -> list[str]:
-    """The environments asked for. Raises UserError."""
-    valid = config.known_names("env")
-    envs = list(valid) if options["envs"] is None else options["envs"]
-    if not isinstance(envs, list):
-        envs = [envs]
-    for env in envs:
-        if env not in valid:
-            raise UserError(f"no environment is called {env!r}; {nearest(str(env), valid)}")
-    if options["out"] is not None and not Path(str(options["out"])).parent.is_dir():
-        raise UserError(f"out={options['out']}: there is no directory {Path(str(options['out'])).parent}")
-    for key in ("repeats", "at_once"):
-        if type(options[key]) is not int or options[key] < 1:
-            raise UserError(f"{key}={options[key]!r}: must be a whole number of at least 1")
-    return envs
-
-
 if __name__ == "__main__":
     sys.argv[0] = "compile_times"
-    command.run(main)
+    command.run(main, COMMAND)

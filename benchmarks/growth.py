@@ -1,9 +1,5 @@
 """`python -m benchmarks.growth`: how time and memory of the whole loop grow with seeds, agents, replay and batch.
 
-    python -m benchmarks.growth [seeds=[1,2,4,8,16,32,64]] [agents=[3,6,12,24]] [replay=[10000,...,1000000]]
-                                [batch=[128,...,8192]] [few_seeds=2] [repeats=5] [seconds=1] [out=FILE.json]
-                                [key=value ...]
-
 simple_spread, each axis alone (an empty list leaves it out); the others stay at the paper's settings with `few_seeds`
 seeds and a replay of 25,600 transitions, where learning starts in the paper. Replays are full. Other keys are settings
 of the run. Each point is a process of its own (`benchmarks.loop`): time of an iteration of all seeds (200 env steps of
@@ -12,18 +8,18 @@ interval, and at most of the whole process. The exponent k of time ~ value^k is 
 through the logarithms: over all points, and over the upper half of them. A figure is drawn beside `out`.
 """
 
-import json
+import dataclasses
 import sys
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks import fresh, growth_figure
 from benchmarks.commit import commit
-from matd3_jax import config
+from benchmarks.options import OfARun
 from matd3_jax.cli import command
+from matd3_jax.cli.options import Command, option
 from matd3_jax.errors import UserError
 from matd3_jax.runtime import devices
 
@@ -34,7 +30,23 @@ AXES: dict[str, list[int]] = {
     "batch": [128, 512, 1024, 2048, 8192],
 }
 BASE = {"agents": 3, "replay": 25_600, "batch": 1024}
-DEFAULTS: dict[str, Any] = {**AXES, "few_seeds": 2, "repeats": 5, "seconds": 1.0, "out": None}
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(OfARun):
+    """Options of this benchmark: the values of each axis, an empty list leaves it out."""
+
+    seeds: tuple[int, ...] = option("numbers of seeds", default=tuple(AXES["seeds"]), least=1)
+    agents: tuple[int, ...] = option("numbers of agents", default=tuple(AXES["agents"]), least=1)
+    replay: tuple[int, ...] = option("transitions that a replay keeps", default=tuple(AXES["replay"]), least=1)
+    batch: tuple[int, ...] = option("transitions of a minibatch", default=tuple(AXES["batch"]), least=1)
+    few_seeds: int = option("seeds of the other axes", default=2, least=1)
+    repeats: int = option("stretches that are timed", default=5, least=1)
+    seconds: float = option("length of a stretch", default=1.0, unit="seconds", above=0)
+
+
+COMMAND = Command("python -m benchmarks.growth", Options, __doc__)
+
 
 QUANTITIES = {
     "time": lambda point: point["cycle_seconds"],
@@ -46,14 +58,12 @@ QUANTITIES = {
 
 
 def main(argv: Sequence[str]) -> int:
-    taken, overrides = config.take(argv, tuple(DEFAULTS))
-    options = {**DEFAULTS, **taken}
-    _check(options)
+    options = COMMAND.parse(argv)
     report: dict[str, Any] = {
         "versions": devices.versions(),
         "commit": commit(),
         "settings": list(argv),
-        "beside": {"seeds": options["few_seeds"], **BASE},
+        "beside": {"seeds": options.few_seeds, **BASE},
     }
     print(f"commit {report['commit']}; beside each axis {report['beside']}")
     print(f"{'axis':<7} {'value':>9} {'ms/iter':>11} {'env steps/s':>12} {'GFLOP':>8} {'XLA, MB':>9} "
@@ -62,11 +72,11 @@ def main(argv: Sequence[str]) -> int:
     report["axes"] = axes
     measured: dict[tuple, dict[str, Any]] = {}
     for axis in AXES:
-        for value in options[axis]:
-            point = {"seeds": options["few_seeds"], **BASE, axis: value}
+        for value in getattr(options, axis):
+            point = {"seeds": options.few_seeds, **BASE, axis: value}
             key = tuple(point.values())
             if key not in measured:
-                measured[key] = _measure([*settings(point), *overrides], options)
+                measured[key] = _measure([*settings(point), *options.overrides], options)
             axes.setdefault(axis, []).append({"value": value, **measured[key]})
             _show(axis, axes[axis][-1])
     report["machine"] = next((m.pop("machine") for m in measured.values() if "machine" in m), None)
@@ -77,11 +87,10 @@ def main(argv: Sequence[str]) -> int:
     for axis, found in report["exponents"].items():
         print(f"{axis}: " + "; ".join(f"{name} ~ {axis}^{k['all']:.2f} (upper half {k['upper']:.2f})"
                                       for name, k in found.items()))  # fmt: skip
-    if options["out"] is not None:
-        out = Path(str(options["out"]))
-        out.write_text(json.dumps(report, indent=1) + "\n")
-        growth_figure.draw(out.with_suffix(".png"), axes)
-        print(f"figure: {out.with_suffix('.png')}")
+    options.write(report)
+    if options.out is not None:
+        growth_figure.draw(options.out.with_suffix(".png"), axes)
+        print(f"figure: {options.out.with_suffix('.png')}")
     return 0
 
 
@@ -121,8 +130,8 @@ def exponent(x: np.ndarray, y: np.ndarray) -> float:
     return float(np.polyfit(np.log(x), np.log(y), 1)[0])
 
 
-def _measure(overrides: Sequence[str], options: Mapping[str, Any]) -> dict[str, Any]:
-    arguments = [f"repeats={options['repeats']}", f"seconds={options['seconds']}", *overrides]
+def _measure(overrides: Sequence[str], options: Options) -> dict[str, Any]:
+    arguments = [f"repeats={options.repeats}", f"seconds={options.seconds}", *overrides]
     try:
         return fresh.run("benchmarks.loop", arguments)
     except UserError as error:  # too large for this machine: the others still count
@@ -140,19 +149,6 @@ def _show(axis: str, point: Mapping[str, Any]) -> None:
           f"{point['compile_seconds']:>9.1f} s", flush=True)  # fmt: skip
 
 
-def _check(options: Mapping[str, Any]) -> None:
-    for axis in AXES:
-        values = options[axis]
-        if not isinstance(values, list) or not all(type(n) is int and n >= 1 for n in values):
-            example = f"{axis}=[{','.join(map(str, AXES[axis][:3]))}]"
-            raise UserError(f"{axis}={values!r}: must be a list of whole numbers of at least 1, for instance {example}")
-    for key in ("few_seeds", "repeats"):
-        if type(options[key]) is not int or options[key] < 1:
-            raise UserError(f"{key}={options[key]!r}: must be a whole number of at least 1")
-    if options["out"] is not None and not Path(str(options["out"])).parent.is_dir():
-        raise UserError(f"out={options['out']}: there is no directory {Path(str(options['out'])).parent}")
-
-
 if __name__ == "__main__":
     sys.argv[0] = "growth"
-    command.run(main)
+    command.run(main, COMMAND)

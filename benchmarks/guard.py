@@ -1,4 +1,4 @@
-"""`python -m benchmarks.guard [record=true]`: has speed or memory of the whole loop got far worse than recorded?
+"""`python -m benchmarks.guard`: has speed or memory of the whole loop got far worse than recorded?
 
 simple_spread, four seeds at the paper's settings with a replay of 100,000 transitions. Only ratios are compared, each
 of things measured in turns within this run, so that another machine or other work on it makes little difference: the
@@ -8,6 +8,7 @@ memory over the replay's. Exit code 1, and one line that names the broken bounds
 CPU cores.
 """
 
+import dataclasses
 import json
 import sys
 import time
@@ -23,6 +24,7 @@ from benchmarks.commit import commit
 from benchmarks.loop import Loop, copies_in
 from matd3_jax import config
 from matd3_jax.cli import command
+from matd3_jax.cli.options import Command, option
 from matd3_jax.errors import UserError
 from matd3_jax.runtime import devices
 
@@ -56,11 +58,18 @@ BOUNDS = {
 }
 
 
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of this benchmark."""
+
+    record: bool = option("true: write what is measured into benchmarks/guard.json", default=False)
+
+
+COMMAND = Command("python -m benchmarks.guard", Options, __doc__)
+
+
 def main(argv: Sequence[str]) -> int:
-    options, rest = config.take(argv, ("record",))
-    record = options.get("record", False)
-    if rest or type(record) is not bool:
-        raise UserError("usage: python -m benchmarks.guard [record=true]")
+    record = COMMAND.parse(argv).record
     begun = time.monotonic()
     devices.prepare()
     platform = jax.default_backend()
@@ -128,4 +137,4 @@ def floor_seconds(loop: Loop, gflops: Any) -> Any:
 
 if __name__ == "__main__":
     sys.argv[0] = "guard"
-    command.run(main)
+    command.run(main, COMMAND)

@@ -1,7 +1,5 @@
 """`python -m benchmarks.limits`: what this machine could do at most: the least time of one iteration of training.
 
-    python -m benchmarks.limits [seeds=20] [repeats=5] [out=FILE.json] [key=value ...]
-
 Other keys are settings of the run, as `python -m matd3_jax.train` takes them. Measured in the same run, on the same
 devices: the rate of every matrix product of the loop, by itself and at its own shape (batched over seeds, agents and
 twins as the loop has them; on one device alone, and on all at once), and the memory's bandwidth. From these and the
@@ -12,13 +10,11 @@ ReLU, no random numbers, no sampling, no optimizer, no environment.
 
 import dataclasses
 import functools
-import json
 import math
 import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -27,8 +23,10 @@ import numpy as np
 
 from benchmarks.commit import commit
 from benchmarks.loop import product_flops
+from benchmarks.options import OfARun
 from matd3_jax import config
 from matd3_jax.cli import command
+from matd3_jax.cli.options import Command, option
 from matd3_jax.core import update
 from matd3_jax.core.agents import Group
 from matd3_jax.runtime import devices
@@ -36,7 +34,16 @@ from matd3_jax.training import memory
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.session import TrainingSession
 
-DEFAULTS: dict[str, Any] = {"seeds": 20, "repeats": 5, "out": None}
+
+@dataclasses.dataclass(frozen=True)
+class Options(OfARun):
+    """Options of this benchmark."""
+
+    seeds: int = option("side by side", default=20, least=1)
+    repeats: int = option("of each measurement", default=5, least=1)
+
+
+COMMAND = Command("python -m benchmarks.limits", Options, __doc__)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -316,14 +323,13 @@ def floor(trainer: TrainLoop, repeats: int = 5, part: str = "loop") -> tuple[Flo
 
 
 def main(argv: Sequence[str]) -> int:
+    options = COMMAND.parse(argv)
     devices.prepare()
-    taken, overrides = config.take(argv, tuple(DEFAULTS))
-    options = {**DEFAULTS, **taken}
-    settings = config.load([f"seeds={options['seeds']}", "total_steps=100000", "eval_every=0", *overrides])
+    settings = config.load([f"seeds={options.seeds}", "total_steps=100000", "eval_every=0", *options.overrides])
     trainer = TrainingSession(settings).trainer
     report: dict[str, Any] = {"machine": devices.description(), "versions": devices.versions()}
     report |= {"commit": commit(), "settings": list(argv)}
-    found, rows = floor(trainer, options["repeats"])
+    found, rows = floor(trainer, options.repeats)
     for row in sorted(rows, key=lambda row: -row["count"] * row["seconds_alone"]):
         shapes = f"{row['equation']:<14} {list(row['left'])} {list(row['right'])}"
         print(f"{shapes:<56} {row['flops'] / row['seconds_alone'] / 1e9:8.1f} GFLOP/s alone "
@@ -338,11 +344,10 @@ def main(argv: Sequence[str]) -> int:
     print(f"least time of an iteration ({steps:,} env steps): products {found.alone * 1e3:.2f} ms (devices as when "
           f"alone; {found.together * 1e3:.2f} all at once), memory {found.moved * 1e3:.2f} ms")  # fmt: skip
     print(f"at most {steps / found.seconds:,.0f} env steps/s, at {found.gflops:.0f} GFLOP/s")
-    if options["out"] is not None:
-        Path(options["out"]).write_text(json.dumps(report, indent=1) + "\n")
+    options.write(report)
     return 0
 
 
 if __name__ == "__main__":
     sys.argv[0] = "limits"
-    command.run(main)
+    command.run(main, COMMAND)

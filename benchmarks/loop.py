@@ -1,10 +1,11 @@
-"""`python -m benchmarks.loop [repeats=5] [seconds=1] [key=value ...]`: the whole loop of one setting, as JSON.
+"""`python -m benchmarks.loop`: the whole loop of one setting, as JSON.
 
 Time of an iteration, counted products, and memory: what XLA says that the compiled interval takes, and what the process
 took at most. `learning_starts` transitions are played first, so that with learning_starts=replay_capacity the replay is
 full. Other keys are settings of the run. `benchmarks.growth` calls this once for each point.
 """
 
+import dataclasses
 import json
 import math
 import re
@@ -20,6 +21,7 @@ import numpy as np
 
 from matd3_jax import config
 from matd3_jax.cli import command
+from matd3_jax.cli.options import Command, option, others
 from matd3_jax.config import Config
 from matd3_jax.runtime import devices
 from matd3_jax.training.loop import TrainLoop
@@ -29,12 +31,24 @@ CYCLES = 2
 """Of one call of the compiled interval: how many does not change the program but for a number."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of this benchmark."""
+
+    repeats: int = option("stretches that are timed", default=5, least=1)
+    seconds: float = option("length of a stretch", default=1.0, unit="seconds", above=0)
+    overrides: tuple[str, ...] = others("any other setting of the run, as matd3_jax.train takes it")
+
+
+COMMAND = Command("python -m benchmarks.loop", Options, __doc__)
+
+
 def main(argv: Sequence[str]) -> int:
+    options = COMMAND.parse(argv)
     devices.prepare()
-    options, overrides = config.take(argv, ("repeats", "seconds"))
-    loop = Loop(config.load(overrides))
-    calls = loop.calls(float(options.get("seconds", 1.0)))
-    times = [loop.cycle_seconds(calls) for _ in range(int(options.get("repeats", 5)))]
+    loop = Loop(config.load(options.overrides))
+    calls = loop.calls(options.seconds)
+    times = [loop.cycle_seconds(calls) for _ in range(options.repeats)]
     trainer = loop.trainer
     steps = trainer.num_seeds * trainer.iteration_steps
     report = {
@@ -152,4 +166,4 @@ def _programs(value: Any) -> list[Any]:
 
 if __name__ == "__main__":
     sys.argv[0] = "loop"
-    command.run(main)
+    command.run(main, COMMAND)

@@ -1,9 +1,5 @@
 """`python -m benchmarks.peers`: env steps/s of this trainer beside other programs that do the same work, in one run.
 
-    python -m benchmarks.peers prepare=true [envs=DIR]          once: environments for the peers that need their own
-    python -m benchmarks.peers [turns=3] [seconds=2] [only=[agilerl,jaxmarl,mpe2,gymnasium,rejax]] [envs=DIR]
-                               [out=FILE.json]
-
 Peers that fit beside this package are installed with its extra `peers`; the others get virtual environments under
 `envs` (default: peers in the cache folder). The rows are fixed (`benchmarks/peers_scripts/rows.py`); `only` leaves out
 whole peers. Everything runs on the CPU, and never two sides at once: in each turn every way to do the work is measured
@@ -13,6 +9,7 @@ do the work in several ways (environments, threads, batch), the one with the hig
 all of them in the JSON. A peer that fails stands there with its error. The markdown table comes last.
 """
 
+import dataclasses
 import json
 import os
 import sys
@@ -25,26 +22,47 @@ import numpy as np
 
 from benchmarks import throughput
 from benchmarks.commit import commit
+from benchmarks.options import Reported
 from benchmarks.peers_scripts import process, rows
 from benchmarks.peers_scripts.process import Process, WorkerError
 from benchmarks.peers_scripts.rows import WORKERS, Row, Variant
-from matd3_jax import config
 from matd3_jax.cli import command
-from matd3_jax.errors import UserError, nearest
+from matd3_jax.cli.options import Command, option
 from matd3_jax.runtime import devices
 
-DEFAULTS: dict[str, Any] = {"prepare": False, "turns": 3, "seconds": 2.0, "only": None, "envs": None, "out": None}
-PATHS = ("envs", "out")
+
+@dataclasses.dataclass(frozen=True)
+class Options(Reported):
+    """Options of this benchmark."""
+
+    prepare: bool = option("true: only make the environments of the peers that need their own, once", default=False)
+    turns: int = option("in each of which every way to do the work is measured", default=3, least=1)
+    seconds: float = option("for each measurement", default=2.0, unit="seconds", above=0)
+    only: tuple[str, ...] = option(
+        "peers", default=tuple(rows.groups(1)), choices=tuple(rows.groups(1)), metavar="[NAME,NAME,...]"
+    )
+    envs: Path | None = option(
+        "where the peers' virtual environments are", default=None, otherwise="matd3_jax/peers in the cache folder"
+    )
+
+    @property
+    def folder(self) -> Path:
+        """Of the virtual environments."""
+        home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+        return home / "matd3_jax" / "peers" if self.envs is None else self.envs.absolute()
+
+
+COMMAND = Command("python -m benchmarks.peers", Options, __doc__, examples=("python -m benchmarks.peers prepare=true",))
 
 Outcome = list[float] | str
 """Env steps/s of a variant, one for each turn, or the line that says why there are none."""
 
 
 def main(argv: Sequence[str]) -> int:
-    options = _options(argv)
-    folder = options["envs"]
-    if options["prepare"]:
-        return prepare(folder, options["only"])
+    options = COMMAND.parse(argv)
+    folder = options.folder
+    if options.prepare:
+        return prepare(folder, options.only)
     devices.prepare()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     report: dict[str, Any] = {
@@ -60,16 +78,15 @@ def main(argv: Sequence[str]) -> int:
     entries: list[dict[str, Any]] = []
     all_versions: dict[str, dict[str, str | None]] = {}
     for name, group in rows.groups(cores).items():
-        if name in options["only"]:
-            outcomes, versions = measure(group, options["turns"], options["seconds"], folder)
+        if name in options.only:
+            outcomes, versions = measure(group, options.turns, options.seconds, folder)
             all_versions |= versions
             entries += [entry(row, outcomes) for row in group]
             lines += [line(row, outcomes, versions) for row in group]
     report |= {"peers": all_versions, "rows": entries, "gflops_after": throughput.matmul_gflops()}
     print(f"gflops_after: {report['gflops_after']}\n")
     print(table(lines))
-    if options["out"] is not None:
-        options["out"].write_text(json.dumps(report, indent=1) + "\n")
+    options.write(report)
     return 0
 
 
@@ -212,36 +229,6 @@ def _range(found: dict[str, float], digits: bool = False) -> str:
     return f"**{texts[0]}** ({texts[1]} to {texts[2]})"
 
 
-# ---- options ---------------------------------------------------------------------------------------------------------
-
-
-def _options(argv: Sequence[str]) -> dict[str, Any]:
-    paths, rest = config.take_text(argv, PATHS)
-    taken, unknown = config.take(rest, tuple(DEFAULTS))
-    if unknown:
-        name = unknown[0].split("=")[0]
-        raise UserError(f"there is no key {name!r}; {nearest(name, DEFAULTS)}")
-    options = {**DEFAULTS, **taken}
-    if type(options["prepare"]) is not bool:
-        raise UserError(f"prepare={options['prepare']!r}: must be true or false")
-    if type(options["turns"]) is not int or options["turns"] < 1:
-        raise UserError(f"turns={options['turns']!r}: must be a whole number of at least 1")
-    if type(options["seconds"]) not in (int, float) or not 0 < options["seconds"] < float("inf"):
-        raise UserError(f"seconds={options['seconds']!r}: must be a positive number")
-    known = list(rows.groups(1))
-    only = known if options["only"] is None else options["only"]
-    options["only"] = only if isinstance(only, list) else [only]
-    for name in options["only"]:
-        if name not in known:
-            raise UserError(f"only={name!r}: no such peer; {nearest(name, known)}")
-    home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-    options["envs"] = Path(paths["envs"]).absolute() if "envs" in paths else home / "matd3_jax" / "peers"
-    options["out"] = Path(paths["out"]) if "out" in paths else None
-    if options["out"] is not None and not options["out"].absolute().parent.is_dir():
-        raise UserError(f"out={options['out']}: there is no directory {options['out'].absolute().parent}")
-    return options
-
-
 if __name__ == "__main__":
     sys.argv[0] = "peers"
-    command.run(main)
+    command.run(main, COMMAND)

@@ -1,45 +1,42 @@
 """`python -m benchmarks.robots`: env steps/s of a robot alone and of the whole loop, over numbers of environments.
 
-    python -m benchmarks.robots [env=ant] [num_envs=[1,16,256,4096]] [seeds=2] [repeats=3] [seconds=2] [loops=true]
-                                [out=FILE.json] [key=value ...]
-
 Other keys are settings of the run. Environments are counted for each seed, rates over all seeds together; the seeds are
 spread over the devices (one for each CPU core), so `seeds` should be a multiple of them. Every row has the paper's
 networks and replays 100 transitions for each env step, in minibatches of 100 with one environment (recipe=paper) and of
 about 1,000 with more. Parts as in `benchmarks.throughput`. `loops=false`: the environment alone.
 """
 
-import json
+import dataclasses
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from benchmarks import throughput
 from benchmarks.commit import commit
-from matd3_jax import config
+from benchmarks.options import OfARun
 from matd3_jax.cli import command
-from matd3_jax.errors import UserError
+from matd3_jax.cli.options import Command, option
 from matd3_jax.runtime import devices
 
-DEFAULTS: dict[str, Any] = {
-    "env": "ant",
-    "num_envs": [1, 16, 256, 4096],
-    "seeds": 2,
-    "repeats": 3,
-    "seconds": 2.0,
-    "loops": True,
-    "out": None,
-}
+
+@dataclasses.dataclass(frozen=True)
+class Options(OfARun):
+    """Options of this benchmark."""
+
+    env: str = option("the robot", default="ant", metavar="NAME")
+    num_envs: tuple[int, ...] = option("numbers of environments", default=(1, 16, 256, 4096), least=1)
+    seeds: int = option("side by side", default=2, least=1)
+    repeats: int = option("stretches that are timed", default=3, least=1)
+    seconds: float = option("length of a stretch", default=2.0, unit="seconds", above=0)
+    loops: bool = option("false: the environment alone", default=True)
+
+
+COMMAND = Command("python -m benchmarks.robots", Options, __doc__)
 
 
 def main(argv: Sequence[str]) -> int:
+    options = COMMAND.parse(argv)
     devices.prepare()
-    taken, overrides = config.take(argv, tuple(DEFAULTS))
-    options = {**DEFAULTS, **taken}
-    counts = options["num_envs"] if isinstance(options["num_envs"], list) else [options["num_envs"]]
-    if not all(type(n) is int and n >= 1 for n in counts):
-        raise UserError(f"num_envs={options['num_envs']!r}: must be whole numbers of at least 1")
     report: dict[str, Any] = {
         "machine": devices.description(),
         "versions": devices.versions(),
@@ -52,17 +49,16 @@ def main(argv: Sequence[str]) -> int:
         print(f"{key}: {report[key]}")
     print(f"{'environments':>12} {'part':<12} {'env steps/s':>12} {'slowest':>10} {'fastest':>10} "
           f"{'of floor':>8}", flush=True)  # fmt: skip
-    for n in counts:
-        parts = None if options["loops"] else ("environment",)
-        settings = [f"env={options['env']}", *schedule(n), *overrides]
-        rows = throughput.measure(settings, options["seeds"], options["repeats"], options["seconds"], parts)
+    for n in options.num_envs:
+        parts = None if options.loops else ("environment",)
+        settings = [f"env={options.env}", *schedule(n), *options.overrides]
+        rows = throughput.measure(settings, options.seeds, options.repeats, options.seconds, parts)
         for row in rows:
             report["rows"].append({"num_envs": n, **row})
             print(f"{n:>12} {row['part']:<12} {row['env_steps_per_second']:>12,.0f} {row['slowest']:>10,.0f} "
                   f"{row['fastest']:>10,.0f} {row['of_floor']:>8.1%}"
                   f"   compiled in {row['compile_seconds']:.0f} s", flush=True)  # fmt: skip
-    if options["out"] is not None:
-        Path(options["out"]).write_text(json.dumps(report, indent=1) + "\n")
+    options.write(report)
     return 0
 
 
@@ -87,4 +83,4 @@ def schedule(num_envs: int) -> list[str]:
 
 if __name__ == "__main__":
     sys.argv[0] = "robots"
-    command.run(main)
+    command.run(main, COMMAND)

@@ -1,7 +1,5 @@
 """`python -m benchmarks.sweep`: what a sweep costs beside as many seeds of one setting.
 
-    python -m benchmarks.sweep [seeds=4] [repeats=5] [steps=1200] [out=FILE.json] [swept key=VALUES ...] [key=value ...]
-
 Takes settings as `python -m matd3_jax.sweep` does (default: the 18 of its documentation) and times, in turns, a stretch
 of `steps` env steps of every seed of each program that the sweep consists of, and of one program with as many seeds of
 the setting without the swept values. The cost is the time of all the sweep's programs over that of the one; compilation
@@ -9,37 +7,46 @@ is told apart. Where a swept value changes what is computed (policy_delay=1 upda
 default), that is in the cost.
 """
 
-import json
+import dataclasses
 import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 
 from benchmarks.commit import commit
+from benchmarks.options import OfARun
 from matd3_jax import config
 from matd3_jax.cli import command, sweep
+from matd3_jax.cli.options import Command, option
 from matd3_jax.config import Config
 from matd3_jax.runtime import devices
 from matd3_jax.sweep import batching
 from matd3_jax.sweep.search_space import SearchSpace
 from matd3_jax.training.session import TrainingSession
 
-DEFAULTS: dict[str, Any] = {"seeds": 4, "repeats": 5, "steps": 1200, "out": None}
+
+@dataclasses.dataclass(frozen=True)
+class Options(OfARun):
+    """Options of this benchmark."""
+
+    seeds: int = option("of each setting", default=4, least=1)
+    repeats: int = option("stretches that are timed", default=5, least=1)
+    steps: int = option("length of a stretch", default=1200, unit="env steps", least=1)
+
+
+COMMAND = Command("python -m benchmarks.sweep", Options, __doc__)
+
 SWEPT = ("algo.lr=0.01,0.003,0.001", "algo.tau=0.01,0.005", "algo.policy_delay=1,2,3")
 SHORT = ("learning_starts=2000", "replay_capacity=10000", "total_steps=10000")
 """A small replay, so that the sweep fits into one piece for each program; rows are drawn at random all the same."""
 
 
 def main(argv: Sequence[str]) -> int:
+    options = COMMAND.parse(argv)
     devices.prepare()
-    keys = [override.key_or_group for override in config.parse(argv, sweep=True)]
-    mine = [text for text, key in zip(argv, keys, strict=True) if key in DEFAULTS]
-    options = {**DEFAULTS, **config.take(mine, tuple(DEFAULTS))[0]}
-    overrides = [*SHORT, *(text for text in argv if text not in mine), f"seeds={options['seeds']}"]
+    overrides = [*SHORT, *options.overrides, f"seeds={options.seeds}"]
     if not SearchSpace.parse(overrides).axes:
         overrides += SWEPT
     _, settings = sweep.read(overrides, None, 0)
@@ -48,8 +55,8 @@ def main(argv: Sequence[str]) -> int:
         groups.setdefault(batching.program(setting), []).append(setting)
     base = config.load(SearchSpace.parse(overrides).fixed)
     alone = [config.load([*SearchSpace.parse(overrides).fixed, f"seeds={len(settings) * base.seeds}"])]
-    programs = [_Program(members, options["steps"]) for members in [alone, *groups.values()]]
-    seconds = np.array([[program.stretch() for program in programs] for _ in range(options["repeats"])])
+    programs = [_Program(members, options.steps) for members in [alone, *groups.values()]]
+    seconds = np.array([[program.stretch() for program in programs] for _ in range(options.repeats)])
     cost = seconds[:, 1:].sum(axis=1) / seconds[:, 0]
     rates = len(settings) * base.seeds * programs[0].steps / seconds[:, 0]
     compiled = [program.compile_seconds for program in programs]
@@ -66,8 +73,7 @@ def main(argv: Sequence[str]) -> int:
     print(f"{report['sweep']} against {len(settings) * base.seeds} seeds of one setting: cost "
           f"{np.median(cost):.3f} ({cost.min():.3f} to {cost.max():.3f}); {np.median(rates):,.0f} env steps/s; "
           f"compiled in {compiled[0]:.0f} s against {' + '.join(f'{s:.0f}' for s in compiled[1:])} s")  # fmt: skip
-    if options["out"] is not None:
-        Path(str(options["out"])).write_text(json.dumps(report, indent=1) + "\n")
+    options.write(report)
     return 0
 
 
@@ -95,4 +101,4 @@ class _Program:
 
 if __name__ == "__main__":
     sys.argv[0] = "sweep"
-    command.run(main)
+    command.run(main, COMMAND)

@@ -1,7 +1,5 @@
 """`python -m benchmarks.throughput`: env steps/s and updates/s of the whole loop, and of each of its parts alone.
 
-    python -m benchmarks.throughput [env=simple_spread] [seeds=[1,4,20]] [repeats=5] [out=FILE.json] [key=value ...]
-
 To compare machines, the rate of a matrix product of the loop's kind on all devices at once is measured first and last.
 
 Other keys are settings of the run, as `python -m matd3_jax.train` takes them. Every figure counts all seeds together
@@ -13,11 +11,10 @@ products of a part alone take on these devices, measured just before and after (
 the share of a part's time that this would be.
 """
 
-import json
+import dataclasses
 import sys
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -26,24 +23,31 @@ import numpy as np
 
 from benchmarks import limits
 from benchmarks.commit import commit
+from benchmarks.options import OfARun
 from matd3_jax import config
 from matd3_jax.cli import command
+from matd3_jax.cli.options import Command, option
 from matd3_jax.core import replay
-from matd3_jax.errors import UserError
 from matd3_jax.runtime import devices
 from matd3_jax.training.loop import TrainLoop, TrainState
 from matd3_jax.training.session import TrainingSession
 
-DEFAULTS: dict[str, Any] = {"seeds": [1, 4, 20], "repeats": 5, "seconds": 1.0, "out": None}
+
+@dataclasses.dataclass(frozen=True)
+class Options(OfARun):
+    """Options of this benchmark."""
+
+    seeds: tuple[int, ...] = option("numbers of seeds", default=(1, 4, 20), least=1)
+    repeats: int = option("stretches that are timed", default=5, least=1)
+    seconds: float = option("length of a stretch", default=1.0, unit="seconds", above=0)
+
+
+COMMAND = Command("python -m benchmarks.throughput", Options, __doc__)
 
 
 def main(argv: Sequence[str]) -> int:
+    options = COMMAND.parse(argv)
     devices.prepare()
-    taken, overrides = config.take(argv, tuple(DEFAULTS))
-    options = {**DEFAULTS, **taken}
-    counts = options["seeds"] if isinstance(options["seeds"], list) else [options["seeds"]]
-    if not all(type(n) is int and n >= 1 for n in counts):
-        raise UserError(f"seeds={options['seeds']!r}: must be whole numbers of at least 1, for instance seeds=[1,4,20]")
     report: dict[str, Any] = {
         "machine": devices.description(),
         "versions": devices.versions(),
@@ -56,8 +60,8 @@ def main(argv: Sequence[str]) -> int:
     print(f"{'seeds':>5} {'part':<12} {'env steps/s':>12} {'slowest':>10} {'fastest':>10} {'updates/s':>10} "
           f"{'of floor':>9}", flush=True)  # fmt: skip
     rows = []
-    for seeds in counts:
-        for row in measure(overrides, seeds, options["repeats"], options["seconds"]):
+    for seeds in options.seeds:
+        for row in measure(options.overrides, seeds, options.repeats, options.seconds):
             rows.append(row)
             print(f"{row['seeds']:>5} {row['part']:<12} {row['env_steps_per_second']:>12,.0f} {row['slowest']:>10,.0f} "
                   f"{row['fastest']:>10,.0f} {row['updates_per_second']:>10,.1f} {row['of_floor']:>9.1%}"
@@ -65,8 +69,7 @@ def main(argv: Sequence[str]) -> int:
     report["rows"] = rows
     report["gflops_after"] = matmul_gflops()
     print(f"gflops_after: {report['gflops_after']}")
-    if options["out"] is not None:
-        Path(options["out"]).write_text(json.dumps(report, indent=1) + "\n")
+    options.write(report)
     return 0
 
 
@@ -214,4 +217,4 @@ def _updates(trainer: TrainLoop, state: TrainState, hyper: Any) -> tuple[TrainSt
 
 if __name__ == "__main__":
     sys.argv[0] = "throughput"
-    command.run(main)
+    command.run(main, COMMAND)

@@ -1,14 +1,12 @@
 """`python -m experiments.all`: every experiment of the paper, one after another, and a summary of all claims.
 
-    python -m experiments.all [scale=paper|small] [seeds=N] [train=true|false] [skip=[ant,...]] [runs=DIR] [out=DIR]
-                              [key=value ...]
-
 Takes the options of the single experiments and gives them to each. Whatever is finished is used as it is, so a call
 that was stopped goes on with the same command. `runs` and `out` are folders of folders here, one for each experiment;
 the summary is summary.md (summary_small.md) in `out`. `skip` leaves experiments out. An experiment that cannot be run
 (no memory, a setting that it does not take) is told of in the summary, and the next one follows.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -26,9 +24,10 @@ from experiments import (
 )
 from experiments.study import RESULTS, Stopped, Study
 from experiments.tidy import Table
-from matd3_jax import config
 from matd3_jax.cli import command
+from matd3_jax.cli.options import Command, option, others
 from matd3_jax.errors import UserError, nearest
+from matd3_jax.runs.paths import check_directory
 
 STUDIES: dict[str, Study] = {
     module.STUDY.name: module.STUDY
@@ -46,29 +45,37 @@ STUDIES: dict[str, Study] = {
 """In this order: first what the paper's main claims are about, last what takes longest."""
 
 
+@dataclasses.dataclass(frozen=True)
+class AllOptions:
+    """Options of all experiments together."""
+
+    skip: tuple[str, ...] = option("experiments to leave out", default=(), metavar="[NAME,NAME,...]")
+    runs: Path | None = option("a folder for the run directories of each", default=None, otherwise="theirs")
+    out: Path = option("a folder for the results of each, and the summary", default=RESULTS)
+    rest: tuple[str, ...] = others("an option of all single experiments (scale=, seeds=, ...), or a setting of all")
+
+
+COMMAND = Command("python -m experiments.all", AllOptions, __doc__, examples=("python -m experiments.all scale=small",))
+
+
 def main(argv: Sequence[str]) -> int:
-    if {"-h", "--help"} & set(argv):
-        print(str(__doc__).strip() + "\n" + study.HELP)
-        return 0
-    taken, rest = config.take(argv, ("skip", "runs", "out"))
-    skip = taken.get("skip", [])
-    for name in skip if isinstance(skip, list) else [skip]:
+    given = COMMAND.parse(argv)
+    for name in given.skip:
         if name not in STUDIES:
-            raise UserError(f"skip={skip}: there is no experiment {name!r}; {nearest(str(name), tuple(STUDIES))}")
-    out = Path(str(taken.get("out", RESULTS)))
+            raise UserError(f"skip={name}: there is no experiment {name!r}; {nearest(name, STUDIES)}")
+    check_directory(given.out, "out")
+    chosen = {name: one for name, one in STUDIES.items() if name not in given.skip}
+    parsed = {name: study.parse(one, given.rest) for name, one in chosen.items()}
     lines: list[str] = []
     failed = 0
-    for name, one in STUDIES.items():
-        if name in skip:
-            continue
-        options, _ = study.parse(one, rest)
-        runs_folder, out_folder = study.places(one, options)
-        more = [f"out={out / out_folder.name}"]
-        more += [f"runs={Path(str(taken['runs'])) / runs_folder.name}"] if "runs" in taken else []
+    for name, one in chosen.items():
+        runs_folder, out_folder = study.places(one, parsed[name])
+        more = [f"out={given.out / out_folder.name}"]
+        more += [] if given.runs is None else [f"runs={given.runs / runs_folder.name}"]
         print(f"\n==== {name}", flush=True)
         lines += [f"## {one.title}", ""]
         try:
-            claims = study.run(one, [*rest, *more])
+            claims = study.run(one, [*given.rest, *more])
             lines += verdict.lines(one.claims(Table({})) if claims is None else claims)
             lines += [] if claims is None else ["", f"[Protocol, all values, figure]({out_folder.name}/table.md)"]
         except UserError as error:
@@ -79,14 +86,14 @@ def main(argv: Sequence[str]) -> int:
             print("stopped; go on with the same command")
             return stopped.code
         lines.append("")
-    small = options["scale"] == "small"
+    small = any(options.scale == "small" for options in parsed.values())
     head = ["# The paper's claims, one by one" + (" (small runs)" if small else ""), "", verdict.DEFINITIONS, ""]
-    out.mkdir(parents=True, exist_ok=True)
-    summary = out / ("summary_small.md" if small else "summary.md")
+    given.out.mkdir(parents=True, exist_ok=True)
+    summary = given.out / ("summary_small.md" if small else "summary.md")
     summary.write_text("\n".join([*head, *lines]).rstrip() + "\n")
     print(f"\nsummary: {summary}")
     return failed
 
 
 if __name__ == "__main__":
-    command.run(main)
+    command.run(main, COMMAND)

@@ -1,24 +1,21 @@
 """`python -m experiments.ant`: MATD3 beside MADDPG, IL-TD3 and single-agent TD3 on a robot shared out among agents.
 
-    python -m experiments.ant [env=ant] [recipe=fast] [algos=[matd3,maddpg,iltd3,td3]] [seeds=6] [train=true]
-                              [runs=runs/ENV] [out=experiments/results/ENV] [key=value ...]
-
 Figure 8 of the paper: deterministic evaluations along training, mean and standard deviation over seeds. `env` is any
 robot, `recipe` one of its recipes, the same for all algorithms (recipe=paper: the paper's settings, days on a CPU);
 scale=small is another robot, the half-cheetah, for 60,000 env steps of two seeds.
 """
 
-from collections.abc import Mapping, Sequence
+import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from experiments import evaluations, figures, study, verdict
-from experiments.study import RESULTS, Study
+from experiments.study import RESULTS, Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
-from matd3_jax import config
 from matd3_jax.cli import command
-from matd3_jax.errors import UserError
+from matd3_jax.cli.options import option
+from matd3_jax.groups import known_names
 
 STANDING = 1000
 """What an ant that stands still gets: 1 for each env step on its feet."""
@@ -26,26 +23,29 @@ STANDING = 1000
 SMALL = ["seeds=2", "total_steps=60000", "eval_every=5000", "eval_episodes=5", "log_every=5000"]
 
 
-def settings(scale: str, options: Mapping[str, Any]) -> dict[str, list[str]]:
-    env = options["env"] or ("ant" if scale == "paper" else "half_cheetah")
+@dataclasses.dataclass(frozen=True)
+class AntOptions(StudyOptions):
+    """Options of this study."""
+
+    env: str | None = option("any robot", default=None, metavar="NAME", otherwise="ant; scale=small: half_cheetah")
+    recipe: str = option("of all algorithms", default="fast", choices=known_names("recipe"))
+    algos: tuple[str, ...] = option(
+        "which to train", default=("matd3", "maddpg", "iltd3", "td3"), choices=tuple(figures.NAMES), metavar="[A,B]"
+    )
+
+
+def settings(scale: str, options: AntOptions) -> dict[str, list[str]]:
+    env = options.env or ("ant" if scale == "paper" else "half_cheetah")
     more = ["seeds=6"] if scale == "paper" else SMALL
-    return {algo: [f"env={env}", f"recipe={options['recipe']}", f"algo={algo}", *more] for algo in options["algos"]}
+    return {algo: [f"env={env}", f"recipe={options.recipe}", f"algo={algo}", *more] for algo in options.algos}
 
 
-def check(options: Mapping[str, Any]) -> None:
-    for algo in options["algos"]:
-        if algo not in figures.NAMES:
-            raise UserError(f"algos={options['algos']}: {algo!r} is not one of {', '.join(figures.NAMES)}")
-    if options["recipe"] not in config.known_names("recipe"):
-        raise UserError(f"recipe={options['recipe']}: must be one of {', '.join(config.known_names('recipe'))}")
-
-
-def place(options: Mapping[str, Any]) -> tuple[Path, Path]:
-    name = options["env"] or ("ant" if options["scale"] == "paper" else "half_cheetah")
-    if options["scale"] == "small" and name != "half_cheetah":
+def place(options: AntOptions) -> tuple[Path, Path]:
+    name = options.env or ("ant" if options.scale == "paper" else "half_cheetah")
+    if options.scale == "small" and name != "half_cheetah":
         name = f"{name}_small"
-    if options["recipe"] != "fast":
-        name = f"{name}_{options['recipe']}"
+    if options.recipe != "fast":
+        name = f"{name}_{options.recipe}"
     return Path("runs") / name, RESULTS / name
 
 
@@ -114,8 +114,7 @@ STUDY = Study(
     details=details,
     keep=("eval_*",),
     evaluations=True,
-    options={"env": None, "recipe": "fast", "algos": ["matd3", "maddpg", "iltd3", "td3"]},
-    check=check,
+    options=AntOptions,
     place=place,
     data="curves.csv",
     figure="curves.png",

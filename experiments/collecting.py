@@ -16,13 +16,9 @@ from experiments import tidy
 from experiments.tidy import Table
 from matd3_jax import config
 from matd3_jax.config import Config
+from matd3_jax.config.schema import UNREPORTED
 from matd3_jax.errors import UserError
 from matd3_jax.runs.directory import RunDirectory
-
-BOOKKEEPING = (
-    *("out", "name", "seeds", "seed", "log_every", "checkpoint_every", "keep_checkpoints", "tensorboard"),
-)  # fmt: skip
-"""Settings that the numbers of one seed do not depend on (but for the seed's own)."""
 
 UNFINISHED = "not finished"
 
@@ -107,7 +103,7 @@ def key_values(keys: Mapping[str, str], settings: Mapping[str, Any]) -> dict[str
 def differences(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     """Settings that differ and matter, by name: (found, wanted)."""
     a, b = _flat(found), _flat(wanted)
-    return {key: (a[key], b[key]) for key in a if key in b and a[key] != b[key] and key not in BOOKKEEPING}
+    return {key: (a[key], b[key]) for key in a if key in b and a[key] != b[key] and key not in UNREPORTED}
 
 
 def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:

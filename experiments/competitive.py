@@ -4,14 +4,13 @@ Figure 4 of the paper: final return of the team in all four pairings of algorith
 The pairs are trained together in one environment. The team are the good agents, in Predator-Prey the three predators.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from experiments import figures, study, tidy, verdict
-from experiments.study import Study
+from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
@@ -32,7 +31,7 @@ def team_is_adversaries(env: str) -> bool:
     return env == "simple_tag"
 
 
-def settings(scale: str, options: Mapping[str, Any]) -> dict[str, list[str]]:
+def settings(scale: str, options: StudyOptions) -> dict[str, list[str]]:
     """Labels are ENV-ALGO-vs-ADVERSARY, as in algo= and adversary=."""
     common = [*SCALES[scale], "eval_every=0", "keep_checkpoints=1"]
     return {

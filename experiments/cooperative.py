@@ -5,12 +5,11 @@ mean."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from experiments import figures, study, tidy, verdict
-from experiments.study import Study
+from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
@@ -28,7 +27,7 @@ SCALES = {
 }
 
 
-def settings(scale: str, options: Mapping[str, Any]) -> dict[str, list[str]]:
+def settings(scale: str, options: StudyOptions) -> dict[str, list[str]]:
     common = [*SCALES[scale], "eval_every=0", "keep_checkpoints=1"]
     return {f"{env}-{algo}": [f"env={env}", f"algo={algo}", *common] for env in ENVS for algo in ALGOS}
 

@@ -1,13 +1,12 @@
 """`python -m experiments.cooperative_navigation`: does it learn what the original learns?
 
-    python -m experiments.cooperative_navigation [seeds=10] [total_steps=250000] [out=experiments/results/simple_spread]
-
 Trains MATD3 and MADDPG on simple_spread with the paper's settings (10,000 episodes of 25 steps) and lays the training
 returns over those of the authors' own program (experiments/reference). Writes the table of both (curves.csv), a figure
 (curves.png), a comparison (table.md) and the machine and versions (machine.json) into `out`.
 """
 
 import csv
+import dataclasses
 import json
 import sys
 import time
@@ -19,9 +18,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import matd3_jax
-from matd3_jax import config
 from matd3_jax.cli import command
+from matd3_jax.cli.options import Command, option, others
 from matd3_jax.figures.learning_curves import curve
+from matd3_jax.runs.paths import check_directory
 from matd3_jax.runtime import devices
 from matd3_jax.stats.intervals import welch_interval
 
@@ -32,25 +32,39 @@ BLOCK = 1000
 """Episodes averaged into one point, as in the authors' tables: a single episode's return varies by about 75."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of this comparison."""
+
+    seeds: int = option("trials of each algorithm", default=10, least=1)
+    total_steps: int = option("of each trial", default=250_000, unit="env steps", least=1)
+    out: Path = option("data, figure and table", default=HERE / "results" / "simple_spread")
+    overrides: tuple[str, ...] = others("any other setting of matd3_jax.train")
+
+
+COMMAND = Command("python -m experiments.cooperative_navigation", Options, __doc__)
+
+
 def main(argv: Sequence[str]) -> int:
-    taken, overrides = config.take(argv, ("seeds", "total_steps", "out"))
-    out = Path(taken.get("out", HERE / "results" / "simple_spread"))
+    options = COMMAND.parse(argv)
+    out = options.out
+    check_directory(out, "out")
     devices.prepare()
-    out.mkdir(parents=True, exist_ok=True)
     ours, seconds = {}, {}
     for algo in ALGORITHMS:
         begun = time.monotonic()
         result = matd3_jax.train(
-            *overrides,
+            *options.overrides,
             env="simple_spread",
             algo=algo,
-            seeds=taken.get("seeds", 10),
-            total_steps=taken.get("total_steps", 250_000),
+            seeds=options.seeds,
+            total_steps=options.total_steps,
             log_every=100 * EPISODE,
             callback=lambda row, algo=algo: print(algo, int(row["step"][0]), row["return_agents"].mean(), flush=True),
         )
         seconds[algo] = round(time.monotonic() - begun, 1)
         ours[algo] = result.metrics
+    out.mkdir(parents=True, exist_ok=True)
     _write_curves(out / "curves.csv", ours)
     facts = {
         "machine": devices.description(),
@@ -140,4 +154,4 @@ def _write_curves(path: Path, metrics: dict[str, dict[str, np.ndarray]]) -> None
 
 if __name__ == "__main__":
     sys.argv[0] = "cooperative_navigation"
-    command.run(main)
+    command.run(main, COMMAND)

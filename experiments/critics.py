@@ -1,18 +1,15 @@
 """`python -m experiments.critics`: whether layer normalization or categorical heads belong in the fast recipe.
 
-    python -m experiments.critics [only=PATTERN] [seeds=6] [train=true] [key=value ...]
-
 Two robots shared out among two agents, MATD3 with recipe=fast, 500,000 env steps: critics as they are, with layer
 normalization, with categorical heads, with both. Each is compared with the recipe as it is by the mean of its
 evaluations in the last third.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from experiments import evaluations, figures, study, verdict
-from experiments.study import Study
+from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
@@ -33,7 +30,7 @@ BASE = "as they are"
 KEYS = {"env": "env.name", "critic_norm": "algo.critic_norm", "critic_head": "algo.critic_head"}
 
 
-def settings(scale: str, options: Mapping[str, Any]) -> dict[str, list[str]]:
+def settings(scale: str, options: StudyOptions) -> dict[str, list[str]]:
     more = ["seeds=6", "total_steps=500000", "eval_every=50000"]
     if scale == "small":
         more = ["seeds=2", "total_steps=60000", "eval_every=20000", "eval_episodes=5"]

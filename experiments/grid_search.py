@@ -1,21 +1,22 @@
-"""`python -m experiments.grid_search [task=particle]`: the paper's grid of learning rate, minibatch and policy delay.
+"""`python -m experiments.grid_search`: the paper's grid of learning rate, minibatch and policy delay.
 
 The paper names the grids and the best points, without a figure. task=particle (Cooperative Navigation, or another
 env=): lr 0.01, 0.003, 0.001 x batch 256, 1000 x d 1, 2, 3. task=ant: lr 0.01, 0.003, 0.001 x batch 100, 300 x tau
 0.005, 0.01."""
 
+import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from experiments import figures, study, tidy, verdict
-from experiments.study import RESULTS, Study
+from experiments.study import RESULTS, Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
+from matd3_jax.cli.options import option
 from matd3_jax.errors import UserError
 from matd3_jax.stats.intervals import mean_interval
 
@@ -36,8 +37,15 @@ SCALES = {
 }
 
 
-def settings(scale: str, options: Mapping[str, Any]) -> dict[str, list[str]]:
-    task = options["task"]
+@dataclasses.dataclass(frozen=True)
+class GridOptions(StudyOptions):
+    """Options of this study."""
+
+    task: str = option("whose grid: Cooperative Navigation's, or the Ant's", default="particle", choices=tuple(GRIDS))
+
+
+def settings(scale: str, options: GridOptions) -> dict[str, list[str]]:
+    task = options.task
     grid = GRIDS[task]
     common = ["algo=matd3", *SCALES[task, scale], "keep_checkpoints=1"]
     return {
@@ -49,16 +57,14 @@ def settings(scale: str, options: Mapping[str, Any]) -> dict[str, list[str]]:
     }
 
 
-def check(options: Mapping[str, Any]) -> None:
-    if options["task"] not in GRIDS:
-        raise UserError(f"task={options['task']}: must be particle or ant")
-    if options["task"] == "ant" and options["scale"] == "small":
+def check(options: GridOptions) -> None:
+    if options.task == "ant" and options.scale == "small":
         raise UserError("task=ant scale=small: the Ant is not trained in minutes; use task=particle, or scale=paper")
 
 
-def place(options: Mapping[str, Any]) -> tuple[Path, Path]:
-    name = "grid_search" + ("_ant" if options["task"] == "ant" else "")
-    name += "" if options["scale"] == "paper" else "_small"
+def place(options: GridOptions) -> tuple[Path, Path]:
+    name = "grid_search" + ("_ant" if options.task == "ant" else "")
+    name += "" if options.scale == "paper" else "_small"
     return Path("runs/experiments") / name, RESULTS / name
 
 
@@ -160,7 +166,7 @@ STUDY = Study(
     details=details,
     keep=("return_agents", "eval_return_agents"),
     points=60,
-    options={"task": "particle"},
+    options=GridOptions,
     check=check,
     place=place,
 )

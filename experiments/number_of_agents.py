@@ -3,16 +3,15 @@
 The paper reports it in one sentence, without a figure. Cooperative Navigation with 2 to 6 agents, MADDPG and MATD3.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy import stats
 
 from experiments import figures, study, verdict
 from experiments.overestimation import measured
-from experiments.study import Study
+from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
@@ -29,7 +28,7 @@ SCALES = {
 }
 
 
-def settings(scale: str, options: Mapping[str, Any]) -> dict[str, list[str]]:
+def settings(scale: str, options: StudyOptions) -> dict[str, list[str]]:
     common = ["env=simple_spread", "env.episode_length=200", *SCALES[scale], "diagnostics.q_bias=true"]
     return {
         f"simple_spread{number}-{algo}": [*common, f"env.num_agents={number}", f"algo={algo}", "keep_checkpoints=1"]

@@ -7,12 +7,11 @@ since the last evaluation, along training with episodes of 200 steps.
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from experiments import figures, study, tidy, verdict
-from experiments.study import Study
+from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
@@ -25,7 +24,7 @@ SCALES = {
 }
 
 
-def settings(scale: str, options: Mapping[str, Any]) -> dict[str, list[str]]:
+def settings(scale: str, options: StudyOptions) -> dict[str, list[str]]:
     common = ["env=simple_spread", "env.episode_length=200", *SCALES[scale], "diagnostics.q_bias=true"]
     return {f"simple_spread-{algo}": [*common, f"algo={algo}", "keep_checkpoints=1"] for algo in ALGOS}
 

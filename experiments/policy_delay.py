@@ -4,14 +4,13 @@ update.
 Figure 5 of the paper: Cooperative Navigation, and Covert Communication, where team and adversary have the same delay.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from experiments import figures, study, tidy, verdict
-from experiments.study import Study
+from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
@@ -25,7 +24,7 @@ SCALES = {
 }
 
 
-def settings(scale: str, options: Mapping[str, Any]) -> dict[str, list[str]]:
+def settings(scale: str, options: StudyOptions) -> dict[str, list[str]]:
     common = [*SCALES[scale], "eval_every=0", "keep_checkpoints=1"]
     return {
         f"{env}-d{delay}": [f"env={env}", "algo=matd3", f"algo.policy_delay={delay}", *common]

@@ -1,20 +1,17 @@
 """`python -m experiments.recipe`: what each part of the fast recipe does for the Ant: parts changed one at a time.
 
-    python -m experiments.recipe [only=PATTERN] [seeds=4] [train=true] [key=value ...]
-
 The Ant in two halves, MATD3, 300,000 env steps. Every setting is the base with one thing changed, and is compared with
 the base by the mean of its evaluations in the last third.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from experiments import evaluations, figures, study, verdict
 from experiments.squashing import COMMON
-from experiments.study import Study
+from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
@@ -62,7 +59,7 @@ SCALES = {
 }
 
 
-def settings(scale: str, options: Mapping[str, Any]) -> dict[str, list[str]]:
+def settings(scale: str, options: StudyOptions) -> dict[str, list[str]]:
     common = [*COMMON, *SCALES[scale], "algo.actor_output=tanh"]
     lines = {}
     for name, changes in CHANGES.items():
@@ -79,7 +76,7 @@ def label(name: str) -> str:
 
 def parts(table: Table) -> dict[str, Table]:
     """The rows of each setting that has been trained to the end, by its name in `CHANGES`."""
-    lines = zip(CHANGES, settings("paper", {}).values(), strict=True)
+    lines = zip(CHANGES, settings("paper", StudyOptions()).values(), strict=True)
     found = {name: table.where(**study.key_values(KEYS, line)) for name, line in lines}
     end = table["step"].max() if len(table) else 0
     return {name: part for name, part in found.items() if len(part) and part["step"].max() > 0.99 * end}

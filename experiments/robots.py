@@ -1,17 +1,14 @@
 """`python -m experiments.robots`: MATD3 with the fast recipe on robots shared out among two to six agents.
 
-    python -m experiments.robots [only=PATTERN] [seeds=3] [train=true] [key=value ...]
-
 One recipe for all of them; the Ant in two halves is in `experiments.ant`. Beside the returns stand those of HARL's
 MATD3 (Zhong et al. 2024), read off its figures.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from experiments import evaluations, figures, study, verdict
-from experiments.study import Study
+from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
@@ -30,7 +27,7 @@ HARL_ANT = 2700.0
 """HARL's MATD3 on the Ant, four agents, after 1M env steps."""
 
 
-def settings(scale: str, options: Mapping[str, Any]) -> dict[str, list[str]]:
+def settings(scale: str, options: StudyOptions) -> dict[str, list[str]]:
     more = ["seeds=3"] if scale == "paper" else ["seeds=2", "total_steps=60000", "eval_every=20000", "eval_episodes=5"]
     return {
         f"{env}-{split}": [f"env={env}", f"env.split={split}", "algo=matd3", "recipe=fast", *more]

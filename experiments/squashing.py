@@ -5,12 +5,11 @@ center + half range x tanh(output), which is the sigmoid of twice the output. If
 twice the learning rate is a tanh.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from experiments import evaluations, figures, study, verdict
-from experiments.study import Study
+from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
@@ -30,7 +29,7 @@ SCALES = {
 }
 
 
-def settings(scale: str, options: Mapping[str, Any]) -> dict[str, list[str]]:
+def settings(scale: str, options: StudyOptions) -> dict[str, list[str]]:
     return {
         f"{squash}-{lr}": [*COMMON, *SCALES[scale], f"algo.actor_output={squash}", f"algo.actor_lr={lr}"]
         for squash, lr in GRID

@@ -17,31 +17,35 @@ from experiments.collecting import Data
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax import config
+from matd3_jax.cli.command import line as line_to_copy
+from matd3_jax.cli.options import Command, asks_for_help, key, option, others
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError
+from matd3_jax.runs.paths import check_directory
 from matd3_jax.runtime import devices
 from matd3_jax.sweep import runner
 from matd3_jax.sweep.runner import Stopped
 
 RESULTS = Path(__file__).parent / "results"
 
-OPTIONS: dict[str, Any] = {
-    "scale": "paper",
-    "seeds": None,
-    "train": True,
-    "only": None,
-    "runs": None,
-    "out": None,
-}
 
-HELP = """
-options: scale=paper|small   the paper's protocol, or one that takes minutes on a laptop
-         seeds=N             trials of each setting (default: the scale's)
-         train=true|false    false: report what there is
-         only=PATTERN        train only the settings whose names match, for instance only=*maddpg*
-         runs=DIR            run directories (default runs/experiments/NAME, or NAME_small)
-         out=DIR             data, figure and table (default experiments/results/NAME, or NAME_small)
-         key=value           any other setting of matd3_jax.train, for all settings of the study"""
+@dataclasses.dataclass(frozen=True)
+class StudyOptions:
+    """Options of every study."""
+
+    scale: str = option(
+        "the paper's protocol, or one that takes minutes on a laptop", default="paper", choices=("paper", "small")
+    )
+    seeds: int | None = option("trials of each setting", default=None, least=1, otherwise="the scale's")
+    train: bool = option("false: report what there is", default=True)
+    only: str | None = option(
+        "train only the settings whose names match, for instance only='*maddpg*'", default=None, metavar="PATTERN"
+    )
+    runs: Path | None = option("run directories", default=None, otherwise="runs/experiments/NAME, or NAME_small")
+    out: Path | None = option(
+        "data, figure and table", default=None, otherwise="experiments/results/NAME, or NAME_small"
+    )
+    overrides: tuple[str, ...] = others("any other setting of matd3_jax.train, for all settings of the study")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,8 +63,8 @@ class Study:
         keep: patterns of the metrics to keep.
         points: rows of each seed's curve that are kept, besides the last 1,000 episodes.
         evaluations: keep the rows with an evaluation only.
-        options: options of its own, with defaults.
-        check: raises UserError for options of its own that will not do.
+        options: `StudyOptions`, or a subclass with options of its own.
+        check: raises UserError for options that do not go together.
         place: (options) -> name of the folders under runs/experiments and experiments/results; default: NAME,
             NAME_small.
         data, figure: names of those files.
@@ -70,7 +74,7 @@ class Study:
     title: str
     help: str
     protocol: str
-    settings: Callable[[str, Mapping[str, Any]], dict[str, list[str]]]
+    settings: Callable[[str, Any], dict[str, list[str]]]
     keys: Mapping[str, str]
     claims: Callable[[Table], list[Claim]]
     draw: Callable[[Table, Path], None]
@@ -78,17 +82,23 @@ class Study:
     keep: tuple[str, ...] = ("return_*",)
     points: int = 120
     evaluations: bool = False
-    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    check: Callable[[Mapping[str, Any]], None] = lambda options: None
-    place: Callable[[Mapping[str, Any]], tuple[Path, Path]] | None = None
+    options: type[StudyOptions] = StudyOptions
+    check: Callable[[Any], None] = lambda options: None
+    place: Callable[[Any], tuple[Path, Path]] | None = None
     data: str = "data.csv"
     figure: str = "figure.png"
+
+    @property
+    def command(self) -> Command[StudyOptions]:
+        """How it is called."""
+        program = f"python -m experiments.{self.name}"
+        return Command(program, self.options, self.help, examples=(f"{program} scale=small",))
 
 
 def main(study: Study, argv: Sequence[str]) -> int:
     """Run a study's command; the exit code."""
-    if {"-h", "--help"} & set(argv):
-        print(study.help.strip() + "\n" + HELP)
+    if asks_for_help(argv):
+        print(study.command.help())
         return 0
     try:
         claims = run(study, argv)
@@ -104,18 +114,21 @@ def run(study: Study, argv: Sequence[str]) -> list[Claim] | None:
 
     Raises UserError for options and directories that will not do, Stopped when a signal ended the training.
     """
-    options, overrides = parse(study, argv)
-    devices.prepare()
+    options = parse(study, argv)
     folder, out = places(study, options)
+    for name, path in (("runs", folder), ("out", out)):
+        check_directory(path, name)
+    devices.prepare()
+    overrides = _overrides(options)
     lines = {label: _merged(line, overrides) for label, line in _checked(study, options, overrides).items()}
     wanted = {label: _load(tuple(line)) for label, line in lines.items()}
     files = out / study.data, out / "runs.json"
     data = collecting.read(*files, study.keys)
     paths: dict[str, list[Path]] = {}
-    if options["train"]:
-        chosen = [label for label in lines if fnmatch.fnmatch(label, options["only"] or "*")]
+    if options.train:
+        chosen = [label for label in lines if fnmatch.fnmatch(label, options.only or "*")]
         if not chosen:
-            raise UserError(f"only={options['only']}: matches none of {', '.join(lines)}")
+            raise UserError(f"only={options.only}: matches none of {', '.join(lines)}")
         missing = {label: wanted[label] for label in chosen if not data.has(label, wanted[label])}
         for label in missing:
             if (folder / "runs" / label / "config.yaml").exists():
@@ -127,7 +140,7 @@ def run(study: Study, argv: Sequence[str]) -> list[Claim] | None:
             continue
         found = paths.get(label) or collecting.find(folder, label, settings)
         if found:
-            told = " ".join([f"python -m experiments.{study.name}", *_told(argv)])
+            told = line_to_copy(f"experiments.{study.name}", *_told(argv))
             how = {"keep": study.keep, "points": study.points, "evaluations": study.evaluations}
             changed |= data.offer(label, *collecting.gather(study.keys, found, told, **how))
     if not data.rows:
@@ -139,7 +152,7 @@ def run(study: Study, argv: Sequence[str]) -> list[Claim] | None:
     return report(study, data, out, options)
 
 
-def report(study: Study, data: Data, out: Path, options: Mapping[str, Any]) -> list[Claim]:
+def report(study: Study, data: Data, out: Path, options: StudyOptions) -> list[Claim]:
     """Figure and table from the data; the claims."""
     study.draw(data.table, out / study.figure)
     claims = study.claims(data.finished)
@@ -151,10 +164,12 @@ def report(study: Study, data: Data, out: Path, options: Mapping[str, Any]) -> l
     return claims
 
 
-def departures(study: Study, data: Data, options: Mapping[str, Any]) -> list[str]:
+def departures(study: Study, data: Data, options: StudyOptions) -> list[str]:
     """Lines on where what was run departs from the paper's protocol, and what is not finished."""
     lines: dict[str, list[str]] = {}
-    paper = study.settings("paper", {**options, "env": None})  # the paper's own environment
+    if hasattr(options, "env"):
+        options = dataclasses.replace(options, env=None)  # the paper's own environment
+    paper = study.settings("paper", options)
     for label, fact in data.facts.items():
         told = []
         if label in paper:
@@ -180,50 +195,43 @@ def departures(study: Study, data: Data, options: Mapping[str, Any]) -> list[str
 # ---- options ---------------------------------------------------------------------------------------------------------
 
 
-def parse(study: Study, argv: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
-    """(options with defaults, overrides for all settings). Raises UserError."""
-    taken, overrides = config.take(argv, (*OPTIONS, *study.options))
-    options = {**OPTIONS, **study.options, **taken}
-    if options["scale"] not in ("paper", "small"):
-        raise UserError(f"scale={options['scale']}: must be paper or small")
-    if type(options["train"]) is not bool:
-        raise UserError(f"train={options['train']}: must be true or false")
-    seeds = options["seeds"]
-    if seeds is not None:
-        if type(seeds) is not int or seeds < 1:
-            raise UserError(f"seeds={seeds}: must be a whole number of at least 1")
-        overrides = [*overrides, f"seeds={seeds}"]
-    for key in ("only", "runs", "out"):
-        options[key] = None if options[key] is None else str(options[key])
+def parse(study: Study, argv: Sequence[str]) -> StudyOptions:
+    """The options of a study. Raises UserError."""
+    options = study.command.parse(argv)
     study.check(options)
-    return options, overrides
+    return options
 
 
-def places(study: Study, options: Mapping[str, Any]) -> tuple[Path, Path]:
+def _overrides(options: StudyOptions) -> list[str]:
+    """What all settings of the study have in the place of their own."""
+    return [*options.overrides, *([] if options.seeds is None else [f"seeds={options.seeds}"])]
+
+
+def places(study: Study, options: StudyOptions) -> tuple[Path, Path]:
     """(folder of the run directories, folder of the results)."""
-    name = study.name if options["scale"] == "paper" else f"{study.name}_small"
+    name = study.name if options.scale == "paper" else f"{study.name}_small"
     folder, out = study.place(options) if study.place else (Path("runs/experiments") / name, RESULTS / name)
-    return Path(options["runs"] or folder), Path(options["out"] or out)
+    return options.runs or folder, options.out or out
 
 
-def _checked(study: Study, options: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, list[str]]:
+def _checked(study: Study, options: StudyOptions, overrides: Sequence[str]) -> dict[str, list[str]]:
     """The study's settings. Raises UserError for overrides that they leave no room for."""
-    lines = study.settings(options["scale"], options)
-    settings = [{text.split("=")[0]: text for text in line} for line in lines.values()]
-    varied = {key for line in settings for key in line if len({other.get(key) for other in settings}) > 1}
+    lines = study.settings(options.scale, options)
+    settings = [{key(text): text for text in line} for line in lines.values()]
+    varied = {name for line in settings for name in line if len({other.get(name) for other in settings}) > 1}
     for override in config.parse(overrides):
-        key = override.key_or_group
-        if key in ("name", "resume", "checkpoint"):
-            raise UserError(f"cannot take {key}= here: the study names its runs and goes on with them by itself")
-        if key in varied:
-            raise UserError(f"cannot take {key}= here: the study itself varies it (only=PATTERN trains a part)")
+        name = override.key_or_group
+        if name in ("name", "resume", "checkpoint"):
+            raise UserError(f"cannot take {name}= here: the study names its runs and goes on with them by itself")
+        if name in varied:
+            raise UserError(f"cannot take {name}= here: the study itself varies it (only=PATTERN trains a part)")
     return lines
 
 
 def _merged(line: Sequence[str], overrides: Sequence[str]) -> list[str]:
     """A setting's overrides with the user's in the place of those for the same keys."""
     keys = {override.key_or_group for override in config.parse(overrides)}
-    return [*(text for text in line if text.split("=")[0] not in keys), *overrides]
+    return [*(text for text in line if key(text) not in keys), *overrides]
 
 
 def key_values(keys: Mapping[str, str], line: Sequence[str]) -> dict[str, Any]:
@@ -238,4 +246,4 @@ def _load(overrides: tuple[str, ...]) -> Config:
 
 def _told(argv: Sequence[str]) -> list[str]:
     """The arguments worth recording: not where files lay."""
-    return [text for text in argv if text.split("=")[0] not in ("runs", "out", "train")]
+    return [text for text in argv if key(text) not in ("runs", "out", "train")]

@@ -4,12 +4,11 @@ Navigation.
 Figure 6 of the paper: return along training for several standard deviations of the noise on the target actions.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from experiments import figures, study, tidy, verdict
-from experiments.study import Study
+from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
@@ -24,7 +23,7 @@ SCALES = {
 }
 
 
-def settings(scale: str, options: Mapping[str, Any]) -> dict[str, list[str]]:
+def settings(scale: str, options: StudyOptions) -> dict[str, list[str]]:
     common = ["env=simple_spread", "algo=matd3", *SCALES[scale], "eval_every=0", "keep_checkpoints=1"]
     return {f"sigma{sigma}": [*common, f"algo.target_noise={sigma}"] for sigma in LEVELS}
 

@@ -1,6 +1,4 @@
-"""`python -m benchmarks.gpu out=DIR`: what a machine with an accelerator should run first: checks, then measurements.
-
-    python -m benchmarks.gpu out=DIR [parts=[check,...]] [minutes=60] [scale=1.0]
+"""`python -m benchmarks.gpu`: what a machine with an accelerator should run first: checks, then measurements.
 
 Parts, in this order; docs/performance_notes.md says what each takes:
     check       one update against the CPU's, single Ant steps against C MuJoCo, no copy of the replay in the loop
@@ -19,6 +17,7 @@ goes on where it stood, and parts can be run one by one. No case begins after `m
 nothing, but is said before the table, and the exit code is 1. `scale=0.01` tries the whole on a small machine.
 """
 
+import dataclasses
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -26,9 +25,9 @@ from pathlib import Path
 from benchmarks.gpu import ant, ant_wide, checks, figure, floor, launches, seeds, targets, variants, wall_clock
 from benchmarks.gpu.report import Report
 from benchmarks.gpu.stretch import Length
-from matd3_jax import config
 from matd3_jax.cli import command
-from matd3_jax.errors import UserError
+from matd3_jax.cli.options import Command, option
+from matd3_jax.runs.paths import check_directory
 from matd3_jax.runtime import devices
 
 PARTS: dict[str, Callable[[Report, float, Length], None]] = {
@@ -44,21 +43,37 @@ PARTS: dict[str, Callable[[Report, float, Length], None]] = {
     "draws": variants.draws,
     "options": variants.options,
 }
-DEFAULTS = {"out": None, "parts": list(PARTS), "minutes": 60, "scale": 1.0}
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of this benchmark."""
+
+    out: Path = option("where the report goes, for instance out=gpu")
+    parts: tuple[str, ...] = option("which to run", default=tuple(PARTS), choices=tuple(PARTS), metavar="[PART,...]")
+    minutes: float = option("after which no case begins", default=60.0, unit="minutes", above=0)
+    scale: float = option("of the work; 0.01 tries the whole on a small machine", default=1.0, above=0)
+
+
+COMMAND = Command(
+    "python -m benchmarks.gpu",
+    Options,
+    __doc__,
+    examples=("python -m benchmarks.gpu out=gpu parts=check,wall_clock",),
+)
 
 
 def main(argv: Sequence[str]) -> int:
-    if {"-h", "--help"} & set(argv):
-        print(str(__doc__).strip())
-        return 0
-    out, parts, minutes, scale = options(argv)
+    options = COMMAND.parse(argv)
+    scale = options.scale
+    check_directory(options.out, "out")
     devices.prepare()
-    report = Report(out, minutes)
+    report = Report(options.out, options.minutes)
     for key, value in report.facts.items():
         print(f"{key}: {value}", flush=True)
     length = Length() if scale >= 1 else Length(iterations=2, seconds=max(0.02, scale), repeats=2)
     for part in PARTS:
-        if part in parts:
+        if part in options.parts:
             PARTS[part](report, scale, length)
     figure.draw(report)
     print("\n".join(targets.lines(report)))
@@ -67,24 +82,6 @@ def main(argv: Sequence[str]) -> int:
     return 1 if report.wrong else 0
 
 
-def options(argv: Sequence[str]) -> tuple[Path, list[str], float, float]:
-    """out, parts, minutes, scale. Raises UserError."""
-    taken, rest = config.take(argv, tuple(DEFAULTS))
-    chosen = {**DEFAULTS, **taken}
-    if rest:
-        raise UserError(f"there is no key {rest[0].split('=')[0]!r}; the keys are {', '.join(DEFAULTS)}")
-    if chosen["out"] is None:
-        raise UserError("out= is missing: where the report goes, for instance out=gpu")
-    parts = chosen["parts"] if isinstance(chosen["parts"], list) else [chosen["parts"]]
-    unknown = [part for part in parts if part not in PARTS]
-    if unknown:
-        raise UserError(f"parts={unknown[0]}: must be some of {', '.join(PARTS)}")
-    for key in ("minutes", "scale"):
-        if type(chosen[key]) not in (int, float) or not chosen[key] > 0:
-            raise UserError(f"{key}={chosen[key]}: must be a number above 0")
-    return Path(str(chosen["out"])), parts, float(chosen["minutes"]), float(chosen["scale"])
-
-
 if __name__ == "__main__":
     sys.argv[0] = "gpu"
-    command.run(main)
+    command.run(main, COMMAND)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.peers_scripts.rows import Worker
+from matd3_jax.cli import command
 
 LIMIT = 900.0
 """Seconds for one answer; compiling included."""
@@ -95,12 +96,16 @@ def python_of(name: str, worker: Worker, folder: Path) -> Path:
     try:
         record = json.loads(_record(worker, folder).read_text())
     except (OSError, ValueError):
-        raise WorkerError(f"not installed: python -m benchmarks.peers prepare=true envs={folder}") from None
+        raise WorkerError(f"not installed: {_prepare(folder)}") from None
     if record["error"] is not None:
         raise WorkerError(f"not installed: {record['error']}")
     if record["requirements"] != [list(part) for part in worker.requirements]:
-        raise WorkerError(f"installed with other versions: python -m benchmarks.peers prepare=true envs={folder}")
+        raise WorkerError(f"installed with other versions: {_prepare(folder)}")
     return folder / worker.package / "bin" / "python"
+
+
+def _prepare(folder: Path) -> str:
+    return command.line("benchmarks.peers", "prepare=true", envs=folder)
 
 
 def install(worker: Worker, folder: Path) -> str | None:

@@ -1,6 +1,6 @@
 """`python -m matd3_jax.render`: make a film of an episode."""
 
-from matd3_jax.cli import command, render
+from matd3_jax.cli import command
 
 if __name__ == "__main__":
-    command.run(render.main)
+    command.run_named("render")

@@ -1,6 +1,6 @@
 """`python -m matd3_jax.train`: train, and leave a run directory."""
 
-from matd3_jax.cli import command, train
+from matd3_jax.cli import command
 
 if __name__ == "__main__":
-    command.run(train.main)
+    command.run_named("train")

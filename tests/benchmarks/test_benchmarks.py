@@ -45,8 +45,8 @@ def test_points_of_the_growth_study_are_possible():
             assert (found.seeds, found.batch_size, found.env["num_agents"]) == (
                 wanted["seeds"], wanted["batch"], wanted["agents"])  # fmt: skip
             assert found.replay_capacity == found.learning_starts == wanted["replay"] <= found.total_steps
-    with pytest.raises(UserError, match="agents=3: must be a list"):
-        growth.main(["agents=3"])
+    with pytest.raises(UserError, match="agents=3,x: must be a list, each a whole number of at least 1"):
+        growth.main(["agents=3,x"])
 
 
 def test_counted_products():

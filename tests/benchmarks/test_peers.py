@@ -154,9 +154,9 @@ def test_rows_ask_the_same_of_both_sides():
         ("turns=0", "turns=0: must be a whole number of at least 1"),
         ("turns=2.5", "turns=2.5: must be"),
         ("seconds=0", "seconds=0: must be a positive number"),
-        ("prepare=yes_please", "prepare='yes_please': must be true or false"),
-        ("only=[agilerl,jaxmarel]", "only='jaxmarel': no such peer; did you mean 'jaxmarl'"),
-        ("out=no/such/place.json", "out=no/such/place.json: there is no directory .*no/such"),
+        ("prepare=yes_please", "prepare=yes_please: must be true or false"),
+        ("only=[agilerl,jaxmarel]", r"only=\[agilerl,jaxmarel\]: must be one of .*; did you mean 'jaxmarl'"),
+        ("out=no/such/place.json", "out=no/such/place.json: there is no directory no/such"),
     ],
 )
 def test_mistakes_on_the_command_line(argument, message):

@@ -129,11 +129,11 @@ BAD = {
     "unknown key": (["runs={0}/mixed", "episods=3"], "episodes"),
     "episodes": (["runs={0}/mixed", "episodes=0"], "episodes=0"),
     "seed": (["runs={0}/mixed", "seed=-1"], "seed=-1"),
-    "pairing": (["runs={0}/mixed", "pairing=both"], "pairing='both': must be one of all, matched"),
-    "deterministic": (["runs={0}/mixed", "deterministic=maybe"], "deterministic='maybe'"),
-    "checkpoint": (["runs={0}/mixed", "checkpoint=last"], "checkpoint='last'"),
+    "pairing": (["runs={0}/mixed", "pairing=both"], "pairing=both: must be one of all, matched"),
+    "deterministic": (["runs={0}/mixed", "deterministic=maybe"], "deterministic=maybe"),
+    "checkpoint": (["runs={0}/mixed", "checkpoint=last"], "checkpoint=last"),
     "out": (["runs={0}/mixed", "out={0}/mixed/config.yaml"], "out=.*cannot make"),
-    "malformed": (["runs={0}/mixed", "episodes=[1"], "cannot read"),
+    "malformed": (["runs={0}/mixed", "episodes=[1"], r"episodes=\[1: must be a whole number"),
 }
 
 
@@ -148,6 +148,16 @@ def test_bad_input_writes_nothing(case, saved, tmp_path, monkeypatch):
     assert before == {p: p.stat().st_mtime_ns for p in saved.rglob("*")} and not list(tmp_path.iterdir())
 
 
+def test_what_fails_while_playing_leaves_no_directory(saved, tmp_path, monkeypatch):
+    def fail(*_):
+        raise MemoryError
+
+    monkeypatch.setattr(crossplay.cross_play, "play", fail)
+    with pytest.raises(MemoryError):
+        crossplay.main([f"runs={saved}/normal", "episodes=2", f"out={tmp_path}/new/place"])
+    assert not list(tmp_path.iterdir())
+
+
 def test_paths(tmp_path, monkeypatch):
     """Names as they are, whatever Hydra would make of them; several runs=; wildcards match run directories only."""
     monkeypatch.chdir(tmp_path)
@@ -155,8 +165,7 @@ def test_paths(tmp_path, monkeypatch):
         (tmp_path / name).mkdir()
     for name in ("b-1", "b-3"):
         (tmp_path / name / "config.yaml").touch()
-    assert paths(["runs=1e3,lr=0.1,007", "seed=3"]) == ([Path("1e3"), Path("lr=0.1"), Path("007")], ["seed=3"])
-    assert paths(["runs=a", "runs=[b, 'c d']"]) == ([Path("a"), Path("b"), Path("c d")], [])
-    assert paths(["runs=b-*"]) == ([Path("b-1"), Path("b-3")], [])
-    assert paths(["runs=b-[3],x"])[0] == [Path("b-3"), Path("x")]
-    assert paths(["checkpoint=3"]) == ([], ["checkpoint=3"])
+    assert paths(["1e3,lr=0.1,007"]) == (Path("1e3"), Path("lr=0.1"), Path("007"))
+    assert paths(["a", "[b, 'c, d', it's]"]) == (Path("a"), Path("b"), Path("c, d"), Path("it's"))
+    assert paths(["b-*"]) == (Path("b-1"), Path("b-3"))
+    assert paths(["b-[3],x"]) == (Path("b-3"), Path("x"))

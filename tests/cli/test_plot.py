@@ -9,7 +9,7 @@ import pytest
 import scipy.stats
 from matplotlib.figure import Figure
 
-from matd3_jax import config
+from matd3_jax import config, lists
 from matd3_jax.cli import plot
 from matd3_jax.config.diff import label_differences
 from matd3_jax.errors import UserError
@@ -181,7 +181,7 @@ def some_runs(tmp_path_factory):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "say which runs to draw: runs="),
+        ([], "runs=A,B is missing"),
         (["runs=nowhere"], "there is no run directory nowhere"),
         (["runs=."], "no config.yaml"),
         (["runs=x*"], r"runs=x\*: no run directory matches"),
@@ -192,11 +192,11 @@ def some_runs(tmp_path_factory):
         (["runs=a,other", "y=eval_return_agents"], "y=eval_return_agents: other has no such column"),
         (["runs=first", "y=agent_0_critic_loss"], "y=agent_0_critic_loss of first: no values with seed 0"),
         (["runs=a", "y="], "say what to draw"),
-        (["runs=a", "x=time"], "x='time': must be one of step, episodes, updates"),
+        (["runs=a", "x=time"], "x=time: must be one of step, episodes, updates"),
         (["runs=a", "out=a.gif"], "out=a.gif: must end with one of .png, .pdf, .svg"),
         (["runs=a", "out=b/a.png"], "there is no directory b"),
-        (["runs=a", "average=mode"], "average='mode': must be one of mean, median, iqm"),
-        (["runs=a", "average=median", "interval=t"], "interval='t': must be one of bootstrap, none"),
+        (["runs=a", "average=mode"], "average=mode: must be one of mean, median, iqm"),
+        (["runs=a", "average=median", "interval=t"], "interval=t: must be one of bootstrap, none"),
         (["runs=a", "window=0"], "window=0: must be a whole number"),
         (["runs=a", "window=100", "y=eval_return_agents"], "from evaluations"),
         (["runs=a", "labels=b,c"], "labels=b,c: names 2, but there are 1: matd3"),
@@ -320,18 +320,21 @@ def test_a_table_that_is_being_written(tmp_path):
     [
         ("A,B", ["A", "B"]),
         ("[A, B]", ["A", "B"]),
-        ("a b=0.10,'c, d',e's", None),
-        ("a b=0.10,'c, d',\"e's\"", ["a b=0.10", "c, d", "e's"]),
+        ("a b=0.10,'c, d',e's", ["a b=0.10", "c, d", "e's"]),
+        ("it's, that's,\"'f\"", ["it's", "that's", "'f"]),
+        ("'a,b", None),
+        ("'a'b", None),
+        ("'[a]'", ["[a]"]),
+        ("a,,'',b,", ["a", "b"]),
         ("", []),
     ],
 )
 def test_words(text, want):
     if want is None:
         with pytest.raises(UserError, match="quotation"):
-            config.words(text)
+            lists.words(text)
     else:
-        assert config.words(text) == want
-    assert config.take_text([f"runs={text}", "b=1", "runs"], ["runs"]) == ({"runs": text}, ["b=1", "runs"])
+        assert lists.words(text) == want
 
 
 # ---- labels ----------------------------------------------------------------------------------------------------------

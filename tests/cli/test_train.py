@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -18,6 +19,7 @@ import pytest
 from matd3_jax import config
 from matd3_jax.cli import command, evaluate, train
 from matd3_jax.errors import UserError
+from matd3_jax.runtime import devices
 from matd3_jax.training import checkpoint
 from matd3_jax.training.session import TrainingSession
 
@@ -78,6 +80,7 @@ def test_a_run_leaves_all_its_files(whole):
 
 def test_the_metrics_table_is_tidy(whole):
     """One row for each seed and interval, steps ascending, everything counted."""
+    assert list(rows(whole)[0]) == TrainingSession(config.read(whole / "config.yaml")).columns
     table = rows(whole)
     steps = sorted({int(row["step"]) for row in table})
     assert [(int(row["step"]), int(row["seed"])) for row in table] == [(s, seed) for s in steps for seed in range(3)]
@@ -310,7 +313,7 @@ BAD = {
     "finished": (["resume={whole}"], "total_steps"),
     "no such checkpoint": (["resume={whole}", "checkpoint=7", "total_steps=9000"], "no checkpoint of step 7"),
     "checkpoint of what": (["checkpoint=700"], "resume="),
-    "checkpoint=last": (["resume={whole}", "checkpoint=last"], "checkpoint='last'"),
+    "checkpoint=last": (["resume={whole}", "checkpoint=last"], "checkpoint=last"),
 }
 
 
@@ -322,6 +325,44 @@ def test_bad_input_to_train_writes_nothing(case, whole, monkeypatch):
     with pytest.raises(UserError, match=wanted.replace("(", r"\(")):
         train.main([*tiny, *(a.format(whole=whole) for a in arguments)])
     assert before == {p: p.stat().st_mtime_ns for p in whole.parent.rglob("*")}
+
+
+CANNOT = {
+    "a missing package": (["tensorboard=true"], "needs tensorboardX"),
+    "memory": (["replay_capacity=100000000", "total_steps=100000000"], "GB are free"),
+    "a file in the way": (["out={out}/file"], "cannot make this directory"),
+    "a name too long": (["name=" + 300 * "a"], "File name too long"),
+    "a backslash": ([r"name=a\b"], "a path has a backslash"),
+    "an environment that does not take its options": (["env.episode_length=0"], "episode_length"),
+}
+
+
+@pytest.mark.parametrize("case", CANNOT)
+def test_a_run_that_cannot_be_trained_leaves_no_directory(case, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
+    monkeypatch.setattr(devices, "free_memory", lambda sharing=1: 10_000_000)
+    (tmp_path / "file").touch()
+    arguments, wanted = CANNOT[case]
+    with pytest.raises(ValueError, match=wanted):
+        run(tmp_path / "new" / "runs", *(text.format(out=tmp_path) for text in arguments))
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_runs_may_be_called_anything_and_printed_lines_can_be_pasted(tmp_path, capsys):
+    """Train, evaluate by the printed line, and go on by the line of an error message."""
+    name = "it's [1e3, a=b] ü"
+    assert run(tmp_path, f"name={name}") == 0
+    assert (tmp_path / name / "summary.json").exists()
+    line = next(text for text in capsys.readouterr().out.splitlines() if text.startswith("evaluate with: "))
+    words = shlex.split(line.removeprefix("evaluate with: "))
+    assert words[:3] == ["python", "-m", "matd3_jax.evaluate"]
+    assert evaluate.main([*words[3:], "episodes=2"]) == 0
+    with pytest.raises(UserError) as error:
+        run(tmp_path, f"name={name}")
+    argument = shlex.split(str(error.value).split("go on with ")[1])
+    assert argument == [f"resume={tmp_path / name}"]
+    with pytest.raises(UserError, match="raise total_steps="):
+        train.main(argument)
 
 
 @pytest.mark.parametrize(
@@ -367,7 +408,7 @@ def test_a_real_process_stops_at_sigint_with_a_checkpoint(tmp_path):
 
 def test_help_and_cfg_write_nothing(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert train.main(["--help"]) == 0
+    assert command.start("train", ["--help"]) == 0
     assert "learning_starts: 25600" in capsys.readouterr().out
     assert train.main(["--cfg", "algo.lr=0.5"]) == 0
     assert "actor_lr: 0.5" in capsys.readouterr().out

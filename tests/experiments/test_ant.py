@@ -63,7 +63,7 @@ def test_report(runs, tmp_path, capsys):
 
 
 def test_bad_input_is_named(tmp_path):
-    with pytest.raises(UserError, match="'matd4' is not one of matd3"):
+    with pytest.raises(UserError, match=r"algos=\[matd4\]: must be one of matd3, .*did you mean 'matd3'"):
         ant.main(["algos=[matd4]"])
     with pytest.raises(UserError, match="there is no run to report"):
         ant.main(["train=false", f"runs={tmp_path}", f"out={tmp_path / 'out'}"])

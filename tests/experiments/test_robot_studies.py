@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from experiments import critics, evaluations, recipe, robots, squashing, study, tidy
+from experiments.study import StudyOptions
 from experiments.tidy import Table
 
 STEPS = np.array([0, 50_000, 100_000, 150_000, 200_000, 250_000, 300_000])
@@ -13,7 +14,7 @@ SEEDS = 4
 def table_of(module, levels):
     """Evaluations of the settings of a study: each rises to its level (by label), seeds 10 apart."""
     parts = []
-    for label, line in module.settings("paper", {}).items():
+    for label, line in module.settings("paper", StudyOptions()).items():
         if label not in levels:
             continue
         keys = study.key_values(module.STUDY.keys, line)
@@ -32,14 +33,14 @@ def words(claims):
 @pytest.mark.parametrize("module", [squashing, robots, recipe, critics])
 def test_tables_survive_their_file_and_every_setting_is_drawn(module, tmp_path):
     """Numbers beside texts in a column (a noise, a range of noise) stay different settings after reading, too."""
-    labels = list(module.settings("paper", {}))
+    labels = list(module.settings("paper", StudyOptions()))
     table = table_of(module, {label: 1000.0 + 100 * k for k, label in enumerate(labels)})
     tidy.write(table, tmp_path / "curves.csv")
     again = tidy.read(tmp_path / "curves.csv")
     for t in (table, again):
         assert len(module.details(t)) == 2 + len(labels)
         module.STUDY.draw(t, tmp_path / "figure.png")
-        for k, (label, line) in enumerate(module.settings("paper", {}).items()):
+        for k, (label, line) in enumerate(module.settings("paper", StudyOptions()).items()):
             part = t.where(**study.key_values(module.STUDY.keys, line))
             assert len(part) == SEEDS * len(STEPS), label
             assert evaluations.curve(part)[1][:, -1].mean() == pytest.approx(1000 + 100 * k)
@@ -72,7 +73,7 @@ def test_recipe():
 
 def test_critics():
     """Each kind is compared with the recipe's critics on the same robot."""
-    levels = {label: 1000.0 for label in critics.settings("paper", {})}
+    levels = {label: 1000.0 for label in critics.settings("paper", StudyOptions())}
     levels |= {"half_cheetah-as_they_are": 2000.0, "half_cheetah-categorical": 2500.0, "ant-both": 700.0}
     found = words(critics.claims(table_of(critics, levels)))
     assert found == ["not shown", "not shown", "opposite", "opposite", "same", "opposite"]

@@ -1,7 +1,9 @@
 """The experiments' commands: from run directories to reports, reuse of data, training, errors."""
 
 import csv
+import dataclasses
 import json
+import shlex
 import shutil
 
 import numpy as np
@@ -9,7 +11,18 @@ import pytest
 from study_cases import NOISE, fake_run, verdicts
 
 from experiments import all as everything
-from experiments import ant, collecting, competitive, cooperative, grid_search, study, target_smoothing, tidy
+from experiments import (
+    ant,
+    collecting,
+    competitive,
+    cooperative,
+    cooperative_navigation,
+    grid_search,
+    study,
+    target_smoothing,
+    tidy,
+)
+from experiments.study import StudyOptions
 from matd3_jax import config
 from matd3_jax.errors import UserError
 from matd3_jax.runs.directory import RunDirectory
@@ -29,7 +42,8 @@ def test_competitive_from_run_directories(tmp_path):
         columns = {"return_agents": (NOISE, ours), "return_adversaries": (NOISE, 0 * NOISE - 50)}
         if env == "simple_tag":
             columns = {"return_adversaries": (NOISE, ours), "return_agents": (NOISE, 0 * NOISE - 50)}
-        overrides = [*competitive.settings("paper", {})[f"{env}-{algo}-vs-{adversary}"][:3], "log_every=7000"]
+        line = competitive.settings("paper", StudyOptions())[f"{env}-{algo}-vs-{adversary}"]
+        overrides = [*line[:3], "log_every=7000"]
         if algo == adversary == "matd3":  # the same without a word
             overrides = overrides[:2] + overrides[3:]
         fake_run(tmp_path / "runs" / f"{env}-{algo}-vs-{adversary}", [*overrides, "eval_every=0"], columns)
@@ -67,7 +81,7 @@ def trained(monkeypatch):
 
 def test_finished_data_are_used_and_only_what_is_missing_is_trained(tmp_path, trained):
     runs, out = tmp_path / "runs", tmp_path / "out"
-    for label, line in target_smoothing.settings("small", {}).items():
+    for label, line in target_smoothing.settings("small", StudyOptions()).items():
         if label != "sigma0.4":
             fake_run(runs / label, [t for t in line if "seeds" not in t], {"return_agents": (NOISE, 10 + NOISE)})
     argv = ["scale=small", f"runs={runs}", f"out={out}"]
@@ -88,7 +102,7 @@ def test_finished_data_are_used_and_only_what_is_missing_is_trained(tmp_path, tr
 
 def test_unfinished_runs_are_drawn_but_claim_nothing(tmp_path):
     runs, out = tmp_path / "runs", tmp_path / "out"
-    for label, line in cooperative.settings("paper", {}).items():
+    for label, line in cooperative.settings("paper", StudyOptions()).items():
         returns = {"return_agents": (NOISE, 10 + NOISE)}
         fake_run(runs / label, [t for t in line if "seeds" not in t], returns, finished=label != "simple_spread-matd3")
     claims = study.run(cooperative.STUDY, ["train=false", f"runs={runs}", f"out={out}"])
@@ -98,7 +112,7 @@ def test_unfinished_runs_are_drawn_but_claim_nothing(tmp_path):
 
 
 def test_seeds_of_several_directories_are_one_setting(tmp_path):
-    line = [t for t in cooperative.settings("paper", {})["simple_spread-matd3"] if "seeds" not in t]
+    line = [t for t in cooperative.settings("paper", StudyOptions())["simple_spread-matd3"] if "seeds" not in t]
     fake_run(tmp_path / "part0", line, {"return_agents": (NOISE, NOISE)})
     fake_run(tmp_path / "part1", [*line, "seed=4"], {"return_agents": (NOISE, NOISE)})
     path = tmp_path / "part1" / "metrics.csv"
@@ -120,7 +134,7 @@ def test_seeds_of_several_directories_are_one_setting(tmp_path):
 
 def test_all_makes_one_summary(tmp_path, monkeypatch):
     monkeypatch.setattr(everything, "STUDIES", {s.STUDY.name: s.STUDY for s in (cooperative, target_smoothing, ant)})
-    for label, line in target_smoothing.settings("paper", {}).items():
+    for label, line in target_smoothing.settings("paper", StudyOptions()).items():
         returns = {"return_agents": (0 * NOISE, 10 + 0.1 * NOISE)}
         fake_run(tmp_path / "runs" / "target_smoothing" / label, [t for t in line if "seeds" not in t], returns)
     argv = ["train=false", "skip=[ant]", f"runs={tmp_path / 'runs'}", f"out={tmp_path / 'out'}"]
@@ -135,7 +149,7 @@ def test_all_makes_one_summary(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("argv", "line"),
     [
-        (["scale=large"], "scale=large: must be paper or small"),
+        (["scale=large"], "scale=large: must be one of paper, small"),
         (["train=maybe"], "train=maybe: must be true or false"),
         (["seeds=0"], "seeds=0: must be a whole number of at least 1"),
         (["only=x*"], "only=x\\*: matches none of simple_spread-matd3, simple_spread-maddpg"),
@@ -151,8 +165,48 @@ def test_bad_input_is_one_line(tmp_path, argv, line):
     assert not (tmp_path / "runs").exists() and not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("key", ["runs", "out"])
+def test_directories_are_checked_before_anything_is_trained(tmp_path, trained, key):
+    (tmp_path / "file").touch()
+    places = {"runs": tmp_path / "runs", "out": tmp_path / "out", key: tmp_path / "file"}
+    with pytest.raises(UserError, match=f"{key}=.*/file: cannot make this directory"):
+        cooperative.main(["scale=small", *(f"{name}={path}" for name, path in places.items())])
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_comparison_that_cannot_be_trained_leaves_no_directory(tmp_path):
+    with pytest.raises(UserError, match="no key 'sedes'"):
+        cooperative_navigation.main(["sedes=3", f"out={tmp_path / 'out'}"])
+    assert not list(tmp_path.iterdir())
+
+
+def test_all_options_are_checked_before_the_first_experiment(tmp_path, trained):
+    """A mistake in what all of them share is found before the first of them begins."""
+    with pytest.raises(UserError, match="scale=smal: must be one of paper, small"):
+        everything.main(["scale=smal", f"out={tmp_path / 'out'}", f"runs={tmp_path / 'runs'}"])
+    assert not list(tmp_path.iterdir())
+
+
+def test_recorded_commands_can_be_pasted(tmp_path):
+    """But for where files lay; a pattern is quoted for the shell."""
+    runs, out = tmp_path / "runs", tmp_path / "out"
+    for label, line in cooperative.settings("paper", StudyOptions()).items():
+        fake_run(runs / label, [t for t in line if "seeds" not in t], {"return_agents": (NOISE, 10 + NOISE)})
+    assert cooperative.main(["train=false", "only=*maddpg* of 'mine'", f"runs={runs}", f"out={out}"]) == 0
+    (told,) = {fact["command"] for fact in json.loads((out / "runs.json").read_text()).values()}
+    assert shlex.split(told) == ["python", "-m", "experiments.cooperative", "only=*maddpg* of 'mine'"]
+
+
+@pytest.mark.parametrize("module", [ant, cooperative, grid_search])
+def test_help_lists_every_option(module, capsys):
+    assert module.main(["--help"]) == 0
+    printed = capsys.readouterr().out
+    names = [field.name for field in dataclasses.fields(module.STUDY.options) if "bounds" in field.metadata]
+    assert all(f"\n  {name}=" in printed for name in names) and str(module.__doc__).splitlines()[-1] in printed
+
+
 def test_runs_with_other_settings_are_refused(tmp_path):
-    line = [t for t in cooperative.settings("paper", {})["simple_spread-matd3"] if "seeds" not in t]
+    line = [t for t in cooperative.settings("paper", StudyOptions())["simple_spread-matd3"] if "seeds" not in t]
     fake_run(tmp_path / "runs" / "simple_spread-matd3", [*line, "algo.lr=0.003"], {"return_agents": (NOISE, NOISE)})
     with pytest.raises(UserError, match="other settings .*algo.actor_lr 0.003 there, 0.01 here.*remove it, or choose"):
         cooperative.main([f"runs={tmp_path}", f"out={tmp_path / 'out'}"])

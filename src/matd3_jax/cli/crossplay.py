@@ -6,50 +6,28 @@ import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from matd3_jax import config, envs
+from matd3_jax import envs
+from matd3_jax.cli import arguments
+from matd3_jax.cli.arguments import CrossPlay
 from matd3_jax.config import Config
 from matd3_jax.envs.environment import Environment
-from matd3_jax.errors import UserError, nearest
+from matd3_jax.errors import UserError
 from matd3_jax.evaluation import cross_play
 from matd3_jax.evaluation.cross_play import TEAMS, Team
 from matd3_jax.evaluation.cross_play_table import Mean, Pairings, pairs_of
 from matd3_jax.figures import heat_map
 from matd3_jax.runs.directory import RunDirectory
-from matd3_jax.runs.paths import paths
+from matd3_jax.runs.paths import check_new_directory
 from matd3_jax.runtime import devices
 from matd3_jax.training import checkpoint
 from matd3_jax.training.session import TrainingSession
-
-HELP = """usage: python -m matd3_jax.crossplay runs=A,B,C [key=value ...]
-
-Plays the agents of every run against the adversaries of every run, all in the same environment and from the same start
-states, and prints the matrix of mean returns with 95 % intervals over seeds. Pairs that were trained together (same
-run, same seed: "own") stand apart from all others.
-
-  runs=A,B,C               run directories, with commas or wildcards (runs=runs/push-*); one alone meets itself
-  pairing=all              every seed with every seed; matched: the first seed of one run with the first of the other...
-  episodes=100             whole episodes of each pair of seeds
-  deterministic=false      sampled, as in training; true: no noise at all
-  seed=0                   of the start states, as in `evaluate`
-  checkpoint=STEP          of all runs; default: the last of each
-  out=crossplay/ENV-TIME   where to: a directory that is not there yet, or empty"""
-
-DEFAULTS: dict[str, Any] = {
-    "pairing": "all",
-    "episodes": 100,
-    "deterministic": False,
-    "seed": 0,
-    "checkpoint": None,
-    "out": None,
-}
-PAIRINGS = ("all", "matched")
 
 
 class Entrant(NamedTuple):
@@ -65,18 +43,20 @@ class Entrant(NamedTuple):
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit code."""
-    if {"-h", "--help"} & set(argv):
-        print(HELP)
-        return 0
+    options = arguments.CROSSPLAY.parse(argv)
+    if options.out is not None:
+        check_new_directory(options.out, "out")
     devices.prepare()
-    where, options = _options(argv)
-    matched = options["pairing"] == "matched"
-    entrants, env = _entrants(where, options["checkpoint"], matched)
-    out = _directory(options["out"], entrants[0].settings)
+    matched = options.pairing == "matched"
+    entrants, env = _entrants(options.runs, options.checkpoint, matched)
+    name = f"{entrants[0].settings.env['name']}-{time.strftime('%Y%m%d-%H%M%S')}"
+    out = options.out or Path("crossplay") / name
+    check_new_directory(out, "out")
     pairings = _play(entrants, env, options, matched)
-    kind = "deterministic" if options["deterministic"] else "sampled"
+    out.mkdir(parents=True, exist_ok=True)
+    kind = "deterministic" if options.deterministic else "sampled"
     who = "seed with seed" if matched else "seeds x seeds"
-    title = f"{entrants[0].settings.env['name']}, {who}, {options['episodes']} {kind} episodes of each pair"
+    title = f"{entrants[0].settings.env['name']}, {who}, {options.episodes} {kind} episodes of each pair"
     _print(pairings, [entrant.name for entrant in entrants], title)
     _write(out, pairings, entrants, options)
     heat_map.draw(out / "heat_map.png", [entrant.name for entrant in entrants], pairings, title)
@@ -131,23 +111,10 @@ def _check_same(env: Environment, first: Config, a: Path, other: Environment, se
             raise UserError(f"runs of different environments cannot meet: env.{name}={one} in {a}, {two} in {b}")
 
 
-def _directory(out: str | None, settings: Config) -> Path:
-    """Where the results go, made now. Raises UserError where something is there already."""
-    path = Path(out or f"crossplay/{settings.env['name']}-{time.strftime('%Y%m%d-%H%M%S')}")
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        taken = any(path.iterdir())
-    except OSError as error:
-        raise UserError(f"out={path}: cannot make this directory: {error.strerror}") from error
-    if taken:
-        raise UserError(f"out={path}: something is there already; choose another directory")
-    return path
-
-
 # ---- playing ---------------------------------------------------------------------------------------------------------
 
 
-def _play(entrants: Sequence[Entrant], env: Environment, options: dict[str, Any], matched: bool) -> Pairings:
+def _play(entrants: Sequence[Entrant], env: Environment, options: CrossPlay, matched: bool) -> Pairings:
     """Everybody against everybody."""
     weights = np.array([np.where(np.array(env.teams) == team, env.return_weights, 0.0) for team in TEAMS])
     cells = [(i, j) for i in range(len(entrants)) for j in range(len(entrants))]
@@ -156,7 +123,7 @@ def _play(entrants: Sequence[Entrant], env: Environment, options: dict[str, Any]
     for i, j in track(cells, "playing", console=console, transient=True, disable=not console.is_terminal):
         pairs = pairs_of(entrants[i].settings.seeds, entrants[j].settings.seeds, matched)
         teams = [entrants[i].teams["agents"], entrants[j].teams["adversaries"]]
-        played = cross_play.play(env, teams, pairs, options["episodes"], options["deterministic"], options["seed"])
+        played = cross_play.play(env, teams, pairs, options.episodes, options.deterministic, options.seed)
         runs.append(np.broadcast_to((i, j), pairs.shape))
         seeds.append(pairs)
         returns.append(played @ weights.T)
@@ -196,7 +163,7 @@ def _words(mean: Mean | None, team: int) -> str:
     return "" if mean is None else heat_map.text(mean.value[team], mean.half[team])
 
 
-def _write(out: Path, pairings: Pairings, entrants: Sequence[Entrant], options: dict[str, Any]) -> None:
+def _write(out: Path, pairings: Pairings, entrants: Sequence[Entrant], options: CrossPlay) -> None:
     names = [entrant.name for entrant in entrants]
     with (out / "pairs.csv").open("w", newline="") as file:
         writer = csv.writer(file)
@@ -206,7 +173,7 @@ def _write(out: Path, pairings: Pairings, entrants: Sequence[Entrant], options: 
             pairings.runs, pairings.seeds, pairings.returns, pairings.own, strict=True
         ):
             who = [x for run, k in zip(runs, seeds, strict=True) for x in (names[run], entrants[run].settings.seed + k)]
-            writer.writerow((*who, _kind(own), *(f"{value:.9g}" for value in returns), options["episodes"]))
+            writer.writerow((*who, _kind(own), *(f"{value:.9g}" for value in returns), options.episodes))
     with (out / "means.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         columns = [name for team in TEAMS for name in (f"return_{team}", f"return_{team}_half_width")]
@@ -224,7 +191,8 @@ def _write(out: Path, pairings: Pairings, entrants: Sequence[Entrant], options: 
         }
         for e in entrants
     }
-    settings = {**{key: options[key] for key in ("pairing", "episodes", "deterministic", "seed")}, "runs": runs}
+    chosen = {key: getattr(options, key) for key in ("pairing", "episodes", "deterministic", "seed")}
+    settings = {**chosen, "runs": runs}
     (out / "crossplay.json").write_text(
         json.dumps({"env": dict(entrants[0].settings.env), **settings, **devices.versions()}, indent=1) + "\n"
     )
@@ -232,25 +200,3 @@ def _write(out: Path, pairings: Pairings, entrants: Sequence[Entrant], options: 
 
 def _kind(own: bool) -> str:
     return "own" if own else "cross"
-
-
-def _options(argv: Sequence[str]) -> tuple[list[Path], dict[str, Any]]:
-    where, rest = paths(argv)
-    taken, rest = config.take(rest, tuple(DEFAULTS))
-    if rest:
-        key = rest[0].split("=")[0]
-        raise UserError(f"there is no key {key!r}; {nearest(key, ['runs', *DEFAULTS])}")
-    if not where:
-        raise UserError("say which runs are to meet: runs=A,B,C")
-    options = {**DEFAULTS, **taken}
-    if options["pairing"] not in PAIRINGS:
-        raise UserError(f"pairing={options['pairing']!r}: must be one of {', '.join(PAIRINGS)}")
-    for key, least, most in (("episodes", 1, 10**6), ("seed", 0, 2**31 - 1)):
-        if type(options[key]) is not int or not least <= options[key] <= most:
-            raise UserError(f"{key}={options[key]!r}: must be a whole number from {least} to {most}")
-    if type(options["deterministic"]) is not bool:
-        raise UserError(f"deterministic={options['deterministic']!r}: must be true or false")
-    if options["checkpoint"] is not None and type(options["checkpoint"]) is not int:
-        raise UserError(f"checkpoint={options['checkpoint']!r}: must be the env step of a checkpoint")
-    options["out"] = None if options["out"] is None else str(options["out"])
-    return where, options

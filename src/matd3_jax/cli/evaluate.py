@@ -2,16 +2,13 @@
 
 import csv
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from matd3_jax import config
+from matd3_jax.cli import arguments
 from matd3_jax.core.rollout import Evaluation
-from matd3_jax.errors import UserError, nearest
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import devices
 from matd3_jax.stats.intervals import mean_interval
@@ -19,27 +16,16 @@ from matd3_jax.training import checkpoint
 from matd3_jax.training.loop import TrainState
 from matd3_jax.training.session import TrainingSession
 
-HELP = """usage: python -m matd3_jax.evaluate run=RUN_DIR [episodes=100] [seed=0] [checkpoint=STEP]
-
-Plays `episodes` episodes with every seed's policies, deterministic (no noise) and sampled (as in training), from the
-start states that `seed` gives; with averaged actors (algo.actor_average) also deterministic with the online ones.
-Prints means over the episodes, and writes every number to RUN_DIR/evaluation.csv."""
-
-DEFAULTS: dict[str, Any] = {"run": None, "episodes": 100, "seed": 0, "checkpoint": None}
-
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit code."""
-    if {"-h", "--help"} & set(argv):
-        print(HELP)
-        return 0
+    options = arguments.EVALUATE.parse(argv)
     devices.prepare()
-    options = _options(argv)
-    run, settings = RunDirectory.open(Path(options["run"]))
+    run, settings = RunDirectory.open(options.run)
     training = TrainingSession(settings)
-    path = checkpoint.verify(run.checkpoints, options["checkpoint"])
+    path = checkpoint.verify(run.checkpoints, options.checkpoint)
     state = checkpoint.restore_actors(path, training.trainer)
-    table = Table(title=f"{run.path}, env step {int(path.name):,}: means of {options['episodes']} episodes a seed")
+    table = Table(title=f"{run.path}, env step {int(path.name):,}: means of {options.episodes} episodes a seed")
     for heading in ("policy", "quantity", *(f"seed {settings.seed + i}" for i in range(settings.seeds)), "mean ± 95 %"):
         table.add_column(heading, justify="left" if heading in ("policy", "quantity") else "right")
     rows = []
@@ -47,15 +33,15 @@ def main(argv: Sequence[str]) -> int:
     if any(group.actor_average is not None for group in state.groups):
         policies = {"deterministic": state, "online": _online(state), "sampled": state}
     for policy, played in policies.items():
-        found = training.evaluate(played, options["episodes"], policy != "sampled", options["seed"])
+        found = training.evaluate(played, options.episodes, policy != "sampled", options.seed)
         for quantity, by_episode in _quantities(training, found):
             by_seed = by_episode.mean(axis=1)
             mean, half = mean_interval(by_seed)
             interval = f"{mean:.2f}" + (f" ± {half:.2f}" if settings.seeds > 1 else "")
             table.add_row(policy, quantity, *(f"{value:.2f}" for value in by_seed), interval)
-            spread = by_episode.std(axis=1, ddof=1) if options["episodes"] > 1 else np.full(settings.seeds, np.nan)
+            spread = by_episode.std(axis=1, ddof=1) if options.episodes > 1 else np.full(settings.seeds, np.nan)
             rows += [
-                (policy, quantity, settings.seed + i, by_seed[i], spread[i], options["episodes"])
+                (policy, quantity, settings.seed + i, by_seed[i], spread[i], options.episodes)
                 for i in range(settings.seeds)
             ]
         table.add_section()
@@ -79,20 +65,3 @@ def _quantities(training: TrainingSession, found: Evaluation) -> list[tuple[str,
     agents = [(f"{agent}_return", returns[:, :, i]) for i, agent in enumerate(layout.agents)]
     measures = [(name, np.asarray(found.measures)[:, :, k]) for k, name in enumerate(training.env.measures)]
     return [*teams, *agents, ("episode_length", np.asarray(found.length)), *measures]
-
-
-def _options(argv: Sequence[str]) -> dict[str, Any]:
-    taken, rest = config.take(argv, tuple(DEFAULTS))
-    if rest:
-        key = rest[0].split("=")[0]
-        raise UserError(f"there is no key {key!r}; {nearest(key, DEFAULTS)}")
-    options = {**DEFAULTS, **taken}
-    if options["run"] is None:
-        raise UserError("say which run to evaluate: run=RUN_DIR")
-    options["run"] = str(options["run"])
-    for key, least in (("episodes", 1), ("seed", 0)):
-        if type(options[key]) is not int or options[key] < least:
-            raise UserError(f"{key}={options[key]!r}: must be a whole number of at least {least}")
-    if options["checkpoint"] is not None and type(options["checkpoint"]) is not int:
-        raise UserError(f"checkpoint={options['checkpoint']!r}: must be the env step of a checkpoint")
-    return options

@@ -1,6 +1,5 @@
 """`matd3 COMMAND ...`: every command under one name."""
 
-import importlib
 import sys
 from collections.abc import Sequence
 
@@ -29,7 +28,7 @@ def main(argv: Sequence[str]) -> int:
     name, *rest = argv
     if name not in COMMANDS:
         raise UserError(f"there is no command {name!r}; {nearest(name, COMMANDS)}")
-    return importlib.import_module(f"matd3_jax.cli.{name}").main(rest)
+    return command.start(name, rest)
 
 
 def script() -> None:

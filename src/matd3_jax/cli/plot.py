@@ -1,51 +1,21 @@
 """`python -m matd3_jax.plot runs=A,B`: learning curves of any set of runs."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from matd3_jax import config
-from matd3_jax.config import diff
+from matd3_jax.cli import arguments
+from matd3_jax.cli.arguments import Plot
+from matd3_jax.config import Config, diff
 from matd3_jax.errors import UserError, nearest
 from matd3_jax.figures import learning_curves
 from matd3_jax.figures.learning_curves import Line, Panel
 from matd3_jax.runs import curves, directory
-from matd3_jax.runs.paths import paths
 from matd3_jax.stats import bootstrap, intervals
 
-HELP = """usage: python -m matd3_jax.plot runs=RUN_DIR,RUN_DIR,... [key=value ...]
-
-Draws a learning curve for each setting: runs whose settings differ only in their seeds are one curve. Runs that have
-not ended are drawn as far as they are.
-
-  runs=A,B            run directories; also [A,B], and patterns: runs='runs/sweep/*'
-  y=return_agents     columns of metrics.csv, a panel for each: y=return_agents,eval_return_agents
-  x=step              step, episodes (ended so far) or updates
-  out=plot.png        where to: a name that ends with .png, .pdf or .svg
-  average=mean        over seeds: mean, median or iqm (interquartile mean)
-  interval=           t (95 %, Student's; the default for the mean), bootstrap (95 %; the default for the others),
-                      sd (a standard deviation to both sides) or none
-  window=             running mean over so many episodes (the paper's: 1000); default: the rows as they are
-  labels=             of the curves, in the order of the runs; default: where the settings differ
-  title=              default: what all runs have in common
-  each=false          true: every seed, too, thin"""
-
-DEFAULTS: dict[str, Any] = {
-    "runs": None,
-    "y": "return_agents",
-    "x": "step",
-    "out": "plot.png",
-    "average": "mean",
-    "interval": None,
-    "window": None,
-    "labels": None,
-    "title": None,
-    "each": False,
-}
-WRITTEN = ("y", "out", "labels", "title")
-"""Taken as they stand on the command line."""
 INTERVALS = {"mean": ("t", "bootstrap", "sd", "none"), "median": ("bootstrap", "none"), "iqm": ("bootstrap", "none")}
 X_LABELS = {"step": "env steps of each seed", "episodes": "episodes of each seed", "updates": "updates"}
 AVERAGES = {"mean": "mean", "median": "median", "iqm": "interquartile mean"}
@@ -54,40 +24,35 @@ BANDS = {"t": "95 % interval", "bootstrap": "95 % bootstrap interval", "sd": "±
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit code."""
-    if {"-h", "--help"} & set(argv):
-        print(HELP)
-        return 0
-    options = _options(argv)
-    groups = _groups(options["runs"])
+    options = _checked(arguments.PLOT.parse(argv))
+    groups = _groups(options.runs)
     settings = list(groups.values())
     found_labels = diff.label_differences(settings)
-    labels = options["labels"] or found_labels
+    labels = options.labels or found_labels
     if len(labels) != len(groups):
         raise UserError(f"labels={','.join(labels)}: names {len(labels)}, but there are {len(groups)}: "
                         f"{'; '.join(found_labels)}")  # fmt: skip
     tables = [directory.together(paths) for paths in groups]
-    found = {
-        name: [_curves(*part, name, options) for part in zip(tables, groups, strict=True)] for name in options["y"]
-    }
-    many = len({len(table.seeds) for table in found[options["y"][0]]}) > 1
+    found = {name: [_curves(*part, name, options) for part in zip(tables, groups, strict=True)] for name in options.y}
+    many = len({len(table.seeds) for table in found[options.y[0]]}) > 1
     panels = [
         Panel(_y_label(name, tables[0]), [_line(*part, many, options) for part in zip(labels, columns, strict=True)])
         for name, columns in found.items()
     ]
-    over = "" if options["window"] is None else f" (mean over the last {options['window']:,} episodes)"
-    title = _common(settings) if options["title"] is None else options["title"]
+    over = "" if options.window is None else f" (mean over the last {options.window:,} episodes)"
+    title = _common(settings) if options.title is None else options.title
     caption = _caption(tables[0], many, options)
-    learning_curves.compare(options["out"], panels, X_LABELS[options["x"]] + over, title, caption, options["each"])
+    learning_curves.compare(options.out, panels, X_LABELS[options.x] + over, title, caption, options.each)
     for panel, (name, columns) in zip(panels, found.items(), strict=True):
         for label, line, column in zip(labels, panel.lines, columns, strict=True):
             _tell(f"{label}: {name}", line.estimate, column, options)
-    print(options["out"])
+    print(options.out)
     return 0
 
 
-def _groups(paths: Sequence[Path]) -> dict[tuple[Path, ...], config.Config]:
+def _groups(paths: Sequence[Path]) -> dict[tuple[Path, ...], Config]:
     """Runs that differ only in their seeds belong together: (paths of a curve: settings of its first run)."""
-    found: list[tuple[dict[str, Any], list[Path], config.Config]] = []
+    found: list[tuple[dict[str, Any], list[Path], Config]] = []
     for path in paths:
         settings = directory.RunDirectory.open(path)[1]
         own = diff.learning(settings)
@@ -99,44 +64,40 @@ def _groups(paths: Sequence[Path]) -> dict[tuple[Path, ...], config.Config]:
     return {tuple(members): settings for _, members, settings in found}
 
 
-def _curves(
-    table: Mapping[str, np.ndarray], paths: Sequence[Path], name: str, options: Mapping[str, Any]
-) -> curves.Curves:
+def _curves(table: Mapping[str, np.ndarray], paths: Sequence[Path], name: str, options: Plot) -> curves.Curves:
     where = ", ".join(map(str, paths))
     if name not in table or name == "seed":
         raise UserError(f"y={name}: {where} has no such column; {nearest(name, (c for c in table if c != 'seed'))}")
     try:
-        return curves.of_table(table, name, options["x"], options["window"])
+        return curves.of_table(table, name, options.x, options.window)
     except ValueError as error:
         raise UserError(f"y={name} of {where}: {error}") from error
 
 
-def _line(label: str, found: curves.Curves, many: bool, options: Mapping[str, Any]) -> Line:
+def _line(label: str, found: curves.Curves, many: bool, options: Plot) -> Line:
     count = len(found.seeds)
     shown = f"{label} ({count} seed{'s' if count > 1 else ''})" if many else label
     return Line(shown, found.x, _estimate(found.values, options), found.values)
 
 
-def _estimate(values: np.ndarray, options: Mapping[str, Any]) -> intervals.Estimate:
+def _estimate(values: np.ndarray, options: Plot) -> intervals.Estimate:
     """Values [seeds, points] as a line with its band [points]."""
-    if options["interval"] == "bootstrap":
-        return bootstrap.average(values, options["average"])
-    if options["interval"] == "t":
+    if options.interval == "bootstrap":
+        return bootstrap.average(values, options.average)
+    if options.interval == "t":
         return intervals.t_interval(values)
-    middle = bootstrap.location(values, options["average"])
-    half = (
-        values.std(axis=0, ddof=1) if options["interval"] == "sd" and len(values) > 1 else np.full_like(middle, np.nan)
-    )
+    middle = bootstrap.location(values, options.average)
+    half = values.std(axis=0, ddof=1) if options.interval == "sd" and len(values) > 1 else np.full_like(middle, np.nan)
     return intervals.Estimate(middle, middle - half, middle + half)
 
 
-def _tell(what: str, estimate: intervals.Estimate, found: curves.Curves, options: Mapping[str, Any]) -> None:
+def _tell(what: str, estimate: intervals.Estimate, found: curves.Curves, options: Plot) -> None:
     """Print where a line ends, what it is there, and which seeds do not go as far as the others."""
     value, low, high = (float(part[-1]) for part in estimate)
     count = len(found.seeds)
-    band = "" if np.isnan(low) else f" ({BANDS[options['interval']]}: {low:.4g} to {high:.4g})"
-    of = f"{AVERAGES[options['average']]} of {count} seeds" if count > 1 else "one seed"
-    print(f"{what} {value:.4g}{band}, {of}, at {options['x']} {found.x[-1]:,.0f}")
+    band = "" if np.isnan(low) else f" ({BANDS[str(options.interval)]}: {low:.4g} to {high:.4g})"
+    of = f"{AVERAGES[options.average]} of {count} seeds" if count > 1 else "one seed"
+    print(f"{what} {value:.4g}{band}, {of}, at {options.x} {found.x[-1]:,.0f}")
     shortest, farthest = found.ends.min(), found.ends.max()
     if farthest - found.x[-1] > 2 * np.diff(found.x, prepend=0).max():
         early = ", ".join(f"{seed:.0f}" for seed in found.seeds[found.ends == shortest])
@@ -155,7 +116,7 @@ def _y_label(name: str, table: Mapping[str, np.ndarray]) -> str:
     return bare.replace("_", " ") + (" (evaluation)" if kind == "evaluation" else "")
 
 
-def _common(settings: Sequence[config.Config]) -> str:
+def _common(settings: Sequence[Config]) -> str:
     """Environment and algorithms, where they are the same in all runs of several."""
     environments = list(dict.fromkeys(str(one.env["name"]) for one in settings))
     names = list(dict.fromkeys(map(diff.algorithms, settings)))
@@ -163,47 +124,28 @@ def _common(settings: Sequence[config.Config]) -> str:
     return ", ".join([*parts, *(names if len(names) == 1 < len(settings) else [])])
 
 
-def _caption(table: Mapping[str, np.ndarray], many: bool, options: Mapping[str, Any]) -> str:
+def _caption(table: Mapping[str, np.ndarray], many: bool, options: Plot) -> str:
     """What lines and bands are, for the legend."""
     count = len(np.unique(table["seed"]))
     if count == 1 and not many:
         return "one seed"
-    band = "" if options["interval"] == "none" else f", {BANDS[options['interval']]}"
-    return f"{AVERAGES[options['average']]} of {'the' if many else count} seeds{band}"
+    band = "" if options.interval == "none" else f", {BANDS[str(options.interval)]}"
+    return f"{AVERAGES[options.average]} of {'the' if many else count} seeds{band}"
 
 
 # ---- options ---------------------------------------------------------------------------------------------------------
 
 
-def _options(argv: Sequence[str]) -> dict[str, Any]:
-    where, rest = paths(argv)
-    written, rest = config.take_text(rest, WRITTEN)
-    taken, rest = config.take(rest, tuple(DEFAULTS))
-    if rest:
-        key = rest[0].split("=")[0]
-        raise UserError(f"there is no key {key!r}; {nearest(key, DEFAULTS)}")
-    options = {**DEFAULTS, **taken, **written, "runs": where}
-    for key in ("y", "labels"):
-        options[key] = options[key] if options[key] is None else config.words(options[key])
-    if not options["runs"]:
-        raise UserError("say which runs to draw: runs=RUN_DIR,RUN_DIR,...")
-    if not options["y"]:
-        raise UserError("say what to draw: y=COLUMN of metrics.csv, for instance y=return_agents")
-    for key, allowed in (("x", curves.AXES), ("average", bootstrap.AVERAGES)):
-        if options[key] not in allowed:
-            raise UserError(f"{key}={options[key]!r}: must be one of {', '.join(allowed)}")
-    offered = INTERVALS[options["average"]]
-    options["interval"] = offered[0] if options["interval"] is None else options["interval"]
-    if options["interval"] not in offered:
-        raise UserError(f"interval={options['interval']!r}: must be one of {', '.join(offered)} "
-                        f"with average={options['average']}")  # fmt: skip
-    window = options["window"]
-    if window is not None and (type(window) is not int or window < 1):
-        raise UserError(f"window={window!r}: must be a whole number of at least 1")
-    for name in options["y"]:
-        if window is not None and curves.evaluated(name):
-            raise UserError(f"window={window}: goes over training episodes, but y={name} is from evaluations")
-    if type(options["each"]) is not bool:
-        raise UserError(f"each={options['each']!r}: must be true or false")
-    options["out"] = learning_curves.check(Path(options["out"]))
-    return options
+def _checked(options: Plot) -> Plot:
+    """The options, with the interval that goes with the average. Raises UserError for what does not go together."""
+    if not options.y:
+        raise UserError("y=: say what to draw, a COLUMN of metrics.csv, for instance y=return_agents")
+    offered = INTERVALS[options.average]
+    interval = options.interval or offered[0]
+    if interval not in offered:
+        raise UserError(f"interval={interval}: must be one of {', '.join(offered)} with average={options.average}")
+    for name in options.y:
+        if options.window is not None and curves.evaluated(name):
+            raise UserError(f"window={options.window}: goes over training episodes, but y={name} is from evaluations")
+    learning_curves.check(options.out)
+    return dataclasses.replace(options, interval=interval)

@@ -1,128 +1,97 @@
 """`python -m matd3_jax.sweep algo.lr=0.01,0.003 seeds=4`: train all combinations, or random draws, and rank them."""
 
 import json
-import shlex
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hydra.core.override_parser.types import Override
-
 from matd3_jax import config
+from matd3_jax.cli import arguments, command, options
+from matd3_jax.cli.arguments import Sweep as SweepOptions
 from matd3_jax.config import Config
-from matd3_jax.errors import UserError
+from matd3_jax.errors import UserError, nearest
 from matd3_jax.figures import sweep as sweep_figure
+from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import devices, multihost, slurm
 from matd3_jax.runtime.multihost import ALONE, Processes
-from matd3_jax.sweep import launcher, ranking, search_space
+from matd3_jax.sweep import batching, launcher, ranking, search_space
 from matd3_jax.sweep.runner import Sweep
 from matd3_jax.sweep.search_space import SearchSpace
+from matd3_jax.training.session import TrainingSession
 
-HELP = """usage: python -m matd3_jax.sweep [env=NAME] [algo=NAME] [key=value ...] key=VALUES ... [option=value ...]
-       python -m matd3_jax.sweep resume=SWEEP_DIR [piece=K] [metric=COLUMN]
-
-Any setting of matd3_jax.train may have several values: a list algo.lr=0.01,0.003,0.001, choice(...), range(1,4), or for
-files glob(*). All combinations are trained with `seeds` seeds each, or with samples=N so many random draws, which may
-come from intervals: algo.lr='interval(1e-4,1e-2)' (log scale where both ends are positive; tag(uniform,interval(...))).
-
-options:
-  samples=N        draw N settings at random (sample_seed=0 says which)
-  metric=COLUMN    of the metrics table, by which settings are ranked (return_agents)
-  memory=GB        that may be used at once (by each process, of several); default: what is free
-  train=false      only plan, and say how to train the pieces
-  launcher=NAME    train the pieces as jobs of a Hydra launcher, e.g. submitit_slurm; launcher.KEY=value: its options
-  name=, out=      the sweep's directory, out/name
-
-{processes}
-
-It ends with a ranked table, table.csv, seeds.csv and sweep.png in its directory; every run is a run directory in runs/,
-for matd3_jax.evaluate, matd3_jax.render and the others."""
-
-OPTIONS: dict[str, Any] = {
-    "samples": None,
-    "sample_seed": 0,
-    "metric": "return_agents",
-    "memory": None,
-    "train": True,
-    "launcher": None,
-    "name": None,
-    "out": "runs",
-}
+METRIC = "return_agents"
+"""By which settings are ranked."""
 
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit code."""
-    if {"-h", "--help"} & set(argv):
-        print(HELP.format(processes=slurm.HELP))
-        return 0
+    given = arguments.SWEEP.parse(argv)
     devices.prepare()
-    given, argv = config.take_text(argv, slurm.KEYS)
-    parsed = config.parse(argv, sweep=True)
-    with multihost.start(given) as processes:
-        processes.check_same(" ".join(argv), "settings")
-        if any(override.key_or_group == "resume" for override in parsed):
-            return resume(argv, processes)
-        return start(argv, parsed, processes)
+    own = [text for text in argv if options.key(text) not in slurm.KEYS]
+    with multihost.start(given.processes()) as processes:
+        processes.check_same(" ".join(own), "settings")
+        if given.resume is not None:
+            return resume(given.resume, given, own, processes)
+        return start(given, own, processes)
 
 
-def start(argv: Sequence[str], parsed: Sequence[Override], processes: Processes) -> int:
-    """A fresh sweep."""
-    launcher_options = [text for text, o in zip(argv, parsed, strict=True) if o.key_or_group.startswith("launcher.")]
-    plain = ("launcher", *OPTIONS)
-    mine = [text for text, o in zip(argv, parsed, strict=True) if o.key_or_group in plain]
-    rest = [text for text in argv if text not in mine and text not in launcher_options]
-    options = {**OPTIONS, **config.take(mine, plain)[0]}
-    _check(options)
-    if launcher_options and options["launcher"] is None:
-        raise UserError(f"{launcher_options[0]}: say which launcher, e.g. launcher=submitit_slurm")
-    if options["launcher"] is not None:
+def start(given: SweepOptions, argv: Sequence[str], processes: Processes) -> int:
+    """A fresh sweep. argv: as it was typed, to be kept."""
+    if given.piece is not None:
+        raise UserError("piece= goes with resume=SWEEP_DIR")
+    if given.launcher_options and given.launcher is None:
+        raise UserError(f"{given.launcher_options[0]}: say which launcher, e.g. launcher=submitit_slurm")
+    if given.launcher is not None:
         if processes.size > 1:
             raise UserError(
-                f"launcher={options['launcher']} starts processes itself: call it from one, not from {processes.size}"
+                f"launcher={given.launcher} starts processes itself: call it from one, not from {processes.size}"
             )
-        launcher.check(options["launcher"], launcher_options)
-    chosen, settings = read(rest, options["samples"], options["sample_seed"])
-    folder = Path(str(options["out"])) / str(options["name"] or f"sweep-{time.strftime('%Y%m%d-%H%M%S')}")
+        launcher.check(given.launcher, given.launcher_options)
+    chosen, settings = read(given.settings, given.samples, given.sample_seed)
+    metric = given.metric or METRIC
+    check_metric(settings.values(), metric)
+    folder = given.out / (given.name or f"sweep-{time.strftime('%Y%m%d-%H%M%S')}")
     if processes.first:
-        _plan(folder, argv, options, dict(zip(settings, chosen, strict=True)), settings, processes)
+        facts = {
+            "command": command.line("matd3_jax.sweep", *argv),
+            "metric": metric,
+            "settings": dict(zip(settings, chosen, strict=True)),
+        }
+        _plan(folder, facts, settings, given.memory, processes)
     folder = processes.same_directory(folder)
     sweep, facts = open_sweep(folder, processes)
-    if options["launcher"] is not None:
-        code = launcher.launch(folder, len(sweep.pieces), str(options["launcher"]), launcher_options)
+    if given.launcher is not None:
+        code = launcher.launch(folder, len(sweep.pieces), given.launcher, given.launcher_options)
         return code or _report_if_finished(sweep, None, facts)
-    if not options["train"]:
+    if not given.train:
         if processes.first:
-            print(f"train a piece with: python -m matd3_jax.sweep resume={folder} piece=K "
-                  f"(0 to {len(sweep.pieces) - 1})\n"
-                  f"then rank with: python -m matd3_jax.sweep resume={folder}")  # fmt: skip
+            print(f"train a piece with: {_resume_line(folder)} piece=K (0 to {len(sweep.pieces) - 1})\n"
+                  f"then rank with: {_resume_line(folder)}")  # fmt: skip
         return 0
     return _train(sweep, None, facts)
 
 
 def _plan(
-    folder: Path,
-    argv: Sequence[str],
-    options: Mapping[str, Any],
-    chosen: Mapping[str, Mapping[str, str]],
-    settings: Mapping[str, Config],
-    processes: Processes,
+    folder: Path, facts: Mapping[str, Any], settings: Mapping[str, Config], memory: float | None, processes: Processes
 ) -> None:
     """Make the sweep's directory, and say what is in it."""
-    if folder.exists():
-        raise UserError(f"{folder} is there already: choose another name=, or go on with resume={folder}")
+    RunDirectory.check_new(folder)
     sweep = Sweep(folder, processes)
-    budget = None if options["memory"] is None else int(options["memory"] * 1e9)
-    runs = sweep.add(settings, budget)
-    facts = {
-        "command": shlex.join(["python", "-m", "matd3_jax.sweep", *argv]),
-        "metric": options["metric"],
-        "settings": chosen,
-        "runs": {name: [path.name for path in paths] for name, paths in runs.items()},
-    }
+    runs = sweep.add(settings, None if memory is None else int(memory * 1e9))
+    facts = {**facts, "runs": {name: [path.name for path in paths] for name, paths in runs.items()}}
     (folder / "sweep.json").write_text(json.dumps(facts, indent=1) + "\n")
     seeds = sum(c.seeds for c in settings.values())
     print(f"sweep directory: {folder}\n{len(settings)} settings, {seeds} seeds, {len(sweep.pieces)} pieces", flush=True)
+
+
+def check_metric(settings: Iterable[Config], metric: str) -> None:
+    """Raise UserError where the metrics table of one of the settings will have no such column."""
+    programs = {batching.program(one): one for one in settings}
+    for one in programs.values():
+        columns = TrainingSession(one).columns
+        if metric not in columns:
+            raise UserError(f"metric={metric}: the metrics table has no such column; {nearest(metric, columns)}")
 
 
 def read(overrides: Sequence[str], samples: int | None, seed: int) -> tuple[list[dict[str, str]], dict[str, Config]]:
@@ -133,23 +102,26 @@ def read(overrides: Sequence[str], samples: int | None, seed: int) -> tuple[list
     settings = {}
     for name, values in zip(search_space.names(space.axes, chosen), chosen, strict=True):
         try:
-            settings[name or "run"] = config.load([*space.fixed, *(f"{k}={v}" for k, v in values.items())])
+            settings[name or "run"] = config.load(
+                [*space.fixed, *(f"{k}={v}" for k, v in values.items())], arguments.SWEEP.keys
+            )
         except UserError as error:
             swept = ", ".join(f"{key}={value}" for key, value in values.items())
             raise UserError(f"{error} (with {swept})" if values else str(error)) from error
     return chosen, settings
 
 
-def resume(argv: Sequence[str], processes: Processes) -> int:
+def resume(folder: Path, given: SweepOptions, argv: Sequence[str], processes: Processes) -> int:
     """Go on with a sweep: all pieces that are not finished, or one, then the table."""
-    taken, rest = config.take(argv, ("resume", "piece", "metric"))
-    if rest:
-        raise UserError(f"cannot take {rest[0]!r} with resume=: a sweep keeps its settings")
-    sweep, facts = open_sweep(Path(str(taken["resume"])), processes)
-    piece = taken.get("piece")
-    if piece is not None and (type(piece) is not int or not 0 <= piece < len(sweep.pieces)):
-        raise UserError(f"piece={piece!r}: {sweep.folder} has the pieces 0 to {len(sweep.pieces) - 1}")
-    return _train(sweep, piece, {**facts, "metric": taken.get("metric", facts["metric"])})
+    for text in argv:
+        if options.key(text) not in ("resume", "piece", "metric"):
+            raise UserError(f"cannot take {text!r} with resume=: a sweep keeps its settings")
+    sweep, facts = open_sweep(folder, processes)
+    if given.piece is not None and given.piece >= len(sweep.pieces):
+        raise UserError(f"piece={given.piece}: {sweep.folder} has the pieces 0 to {len(sweep.pieces) - 1}")
+    if given.metric is not None:
+        check_metric([member for k in range(len(sweep.pieces)) for member in sweep.members(k)], given.metric)
+    return _train(sweep, given.piece, {**facts, "metric": given.metric or facts["metric"]})
 
 
 def open_sweep(folder: Path, processes: Processes = ALONE) -> tuple[Sweep, dict[str, Any]]:
@@ -165,7 +137,7 @@ def _train(sweep: Sweep, piece: int | None, facts: Mapping[str, Any]) -> int:
     if not sweep.processes.first:
         return sweep.processes.tell()
     if code:
-        print(f"stopped; go on with: python -m matd3_jax.sweep resume={sweep.folder}")
+        print(f"stopped; go on with: {_resume_line(sweep.folder)}")
     return sweep.processes.tell(code or _report_if_finished(sweep, piece, facts))
 
 
@@ -174,9 +146,12 @@ def _report_if_finished(sweep: Sweep, piece: int | None, facts: Mapping[str, Any
     if not left:
         report(sweep, facts)
         return 0
-    print(f"not finished yet: piece {', '.join(map(str, left))}; go on with: python -m matd3_jax.sweep "
-          f"resume={sweep.folder}")  # fmt: skip
+    print(f"not finished yet: piece {', '.join(map(str, left))}; go on with: {_resume_line(sweep.folder)}")
     return 0 if piece is not None and piece not in left else 1
+
+
+def _resume_line(folder: Path) -> str:
+    return command.line("matd3_jax.sweep", resume=folder)
 
 
 def report(sweep: Sweep, facts: Mapping[str, Any]) -> None:
@@ -187,15 +162,3 @@ def report(sweep: Sweep, facts: Mapping[str, Any]) -> None:
     sweep_figure.draw(sweep.folder / "sweep.png", sweep.runs, facts["runs"], rows, str(facts["metric"]))
     print(f"all settings: {sweep.folder / 'table.csv'}, all seeds: {sweep.folder / 'seeds.csv'}\n"
           f"figure: {sweep.folder / 'sweep.png'}\nruns: {sweep.runs}")  # fmt: skip
-
-
-def _check(options: Mapping[str, Any]) -> None:
-    for key, least in (("samples", 1), ("sample_seed", 0)):
-        value = options[key]
-        if value is not None and (type(value) is not int or value < least):
-            raise UserError(f"{key}={value!r}: must be a whole number of at least {least}")
-    memory = options["memory"]
-    if memory is not None and (isinstance(memory, bool) or not isinstance(memory, int | float) or memory <= 0):
-        raise UserError(f"memory={memory!r}: must be a positive number of gigabytes")
-    if not isinstance(options["train"], bool):
-        raise UserError(f"train={options['train']!r}: must be true or false")

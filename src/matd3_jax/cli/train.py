@@ -3,11 +3,11 @@
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from matd3_jax import config
+from matd3_jax.cli import arguments, command, options
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError
 from matd3_jax.figures import learning_curves, q_bias
@@ -23,47 +23,24 @@ from matd3_jax.training.loop import TrainState
 from matd3_jax.training.progress import ProgressBar
 from matd3_jax.training.session import Row, TrainingSession
 
-HELP = """usage: python -m matd3_jax.train [env=NAME] [algo=NAME] [adversary=NAME] [recipe=NAME] [key=value ...]
-       python -m matd3_jax.train resume=RUN_DIR [checkpoint=STEP] [total_steps=N]
-       python -m matd3_jax.train --cfg [key=value ...]     print the resolved settings and stop
-
-environments: {envs}
-algorithms:   {algos}
-recipes:      {recipes} (of robots; fast by default)
-
-{processes}
-
-settings and their defaults (those of a file: env.KEY=value, algo.KEY=value, adversary.KEY=value); robots bring others
-along, which --cfg env=ant prints:
-
-{settings}"""
-
-
 ENGINES = {"c": "C MuJoCo", "mjx": "MuJoCo in JAX", "mjx_fast": "MuJoCo in JAX with brax's approximate settings"}
 """What a robot's `physics` may be."""
 
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit code."""
-    if {"-h", "--help"} & set(argv):
-        settings = (config.FOLDER / "config.yaml").read_text()
-        names = {"envs": ", ".join(config.known_names("env")), "algos": ", ".join(config.known_names("algo"))}
-        names["recipes"] = ", ".join(config.known_names("recipe"))
-        print(HELP.format(settings=settings.split("\n\n", 2)[2], processes=slurm.HELP, **names))
-        return 0
-    if "--cfg" in argv:
-        print(config.text(config.load([a for a in argv if a != "--cfg"])), end="")
+    given = arguments.TRAIN.parse(argv)
+    if given.cfg:
+        print(config.text(config.load(given.settings, arguments.TRAIN.keys)), end="")
         return 0
     devices.prepare()
-    given, argv = config.take_text(argv, slurm.KEYS)
-    taken, overrides = config.take(argv, ("resume", "checkpoint"))
-    with multihost.start(given) as processes:
-        processes.check_same(" ".join(argv), "settings")
-        if taken.get("resume") is not None:
-            return resume(Path(str(taken["resume"])), taken.get("checkpoint"), overrides, processes)
-        if taken.get("checkpoint") is not None:
+    with multihost.start(given.processes()) as processes:
+        processes.check_same(" ".join(text for text in argv if options.key(text) not in slurm.KEYS), "settings")
+        if given.resume is not None:
+            return resume(given.resume, given.checkpoint, given.settings, processes)
+        if given.checkpoint is not None:
             raise UserError("checkpoint= goes with resume=RUN_DIR")
-        return start(config.load(overrides), processes)
+        return start(config.load(given.settings, arguments.TRAIN.keys), processes)
 
 
 def start(settings: Config, processes: Processes) -> int:
@@ -73,6 +50,9 @@ def start(settings: Config, processes: Processes) -> int:
     if settings.tensorboard:
         TensorBoardLogger.check()
     path = Path(settings.out) / (settings.name or _name(settings))
+    if processes.first:
+        RunDirectory.check_new(path)
+    processes.barrier()  # nothing is written before all processes have found that they can train
     machine = {"versions": devices.versions(), **processes.description()}
     if processes.first:
         run = RunDirectory.create(path, settings, machine)
@@ -85,13 +65,12 @@ def start(settings: Config, processes: Processes) -> int:
     return _advance(training, run, state, row, stop)
 
 
-def resume(path: Path, step: Any, overrides: Sequence[str], processes: Processes) -> int:
+def resume(path: Path, step: int | None, overrides: Sequence[str], processes: Processes) -> int:
     """Go on with a run from a checkpoint."""
-    changed, rest = config.take(overrides, ("total_steps",))
-    if rest:
-        raise UserError(f"cannot take {rest[0]!r} with resume=: a run keeps its settings; only total_steps may change")
-    if step is not None and type(step) is not int:
-        raise UserError(f"checkpoint={step!r}: must be the env step of a checkpoint")
+    for text in overrides:
+        if options.key(text) != "total_steps":
+            raise UserError(f"cannot take {text!r} with resume=: a run keeps its settings; only total_steps may change")
+    changed = {override.key_or_group: override.value() for override in config.parse(overrides)}
     run, settings = RunDirectory.open(path)
     settings = config.from_dict({**settings.to_dict(), **changed})
     training = TrainingSession(settings, processes=processes)
@@ -135,8 +114,8 @@ def _advance(training: TrainingSession, run: RunDirectory, state: TrainState, ro
         _draw(training, run)
     if outcome.stopped is not None:
         if first:
-            print(f"stopped by {outcome.stopped.name} at env step {step:,}; go on with: "
-                  f"python -m matd3_jax.train resume={run.path}")  # fmt: skip
+            line = command.line("matd3_jax.train", resume=run.path)
+            print(f"stopped by {outcome.stopped.name} at env step {step:,}; go on with: {line}")
         return 128 + outcome.stopped
     if first:
         _finish(training, run, outcome.row, {"seconds": round(time.monotonic() - begun, 1), **progress.rates()})
@@ -168,7 +147,7 @@ def _finish(training: TrainingSession, run: RunDirectory, row: Row, times: Mappi
             print(line)
         print(f"estimated and true values: {run.q_bias}")
     run.write_summary(facts)
-    print(f"learning curve: {run.curve}\nevaluate with: python -m matd3_jax.evaluate run={run.path}")
+    print(f"learning curve: {run.curve}\nevaluate with: {command.line('matd3_jax.evaluate', run=run.path)}")
 
 
 def _announce(training: TrainingSession, run: RunDirectory, done: int = 0) -> None:

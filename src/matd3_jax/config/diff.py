@@ -5,14 +5,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from matd3_jax import config as configuration
-from matd3_jax.config import Config
+from matd3_jax.config import Config, schema
+from matd3_jax.config.schema import Affects
 from matd3_jax.errors import UserError
 
-SEEDS = ("seed", "seeds")
-
-RECORDS = ("total_steps", "name", "out", "log_every", "eval_every", "eval_episodes", "checkpoint_every",
-           "keep_checkpoints", "tensorboard", "diagnostics")  # fmt: skip
-"""Keys that say how long a run goes and what it leaves behind; they do not change how it learns."""
+NOT_LEARNING = schema.keys(Config, Affects.SEEDS, Affects.BOOKKEEPING)
+"""Keys that say which seeds a run has, how long it goes and what it leaves behind: not how it learns."""
 
 NAMES = ("env.name", "algo.name", "adversary.name")
 
@@ -24,8 +22,8 @@ def flat(config: Config) -> dict[str, Any]:
 
 
 def learning(config: Config) -> dict[str, Any]:
-    """What makes a run learn as it does: `flat` without seeds and `RECORDS`."""
-    return {key: value for key, value in flat(config).items() if key.split(".")[0] not in (*SEEDS, *RECORDS)}
+    """What makes a run learn as it does: `flat` without `NOT_LEARNING`."""
+    return {key: value for key, value in flat(config).items() if key.split(".")[0] not in NOT_LEARNING}
 
 
 def differing(settings: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -71,7 +69,7 @@ def label_differences(configs: Sequence[Config]) -> list[str]:
         labels.append(", ".join(parts) or ("" if keys else algorithms(config)))
     labels = _told_apart(labels, [f"seeds {c.seed} to {c.seed + c.seeds - 1}" for c in configs])
     rest = differing([flat(config) for config in configs])
-    rest = [key for key in rest if key.split(".")[0] in RECORDS]
+    rest = [key for key in rest if key.split(".")[0] in schema.RECORDS]
     labels = _told_apart(labels, [", ".join(f"{k}={text(_get(flat(c), k))}" for k in rest) for c in configs])
     seen: Counter[str] = Counter()
     repeated = {label for label, count in Counter(labels).items() if count > 1}

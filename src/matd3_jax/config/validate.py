@@ -1,23 +1,12 @@
 """Which settings are impossible, alone or together."""
 
-import math
+import dataclasses
 from typing import TYPE_CHECKING, Any
 
 from matd3_jax.errors import UserError
 
 if TYPE_CHECKING:
-    from matd3_jax.config import AlgoConfig, Config
-
-CHOICES = {
-    "critic": ("central", "own"),
-    "critic_norm": ("none", "layer"),
-    "critic_head": ("scalar", "categorical"),
-    "clip": ("variable", "network", "none"),
-    "adam": ("standard", "epsilon_hat"),
-    "actor_output": ("sigmoid", "tanh"),
-    "update_order": ("simultaneous", "sequential"),
-    "warmup": ("policy", "random"),
-}
+    from matd3_jax.config.schema import AlgoConfig, Config
 
 
 def check(config: "Config") -> None:
@@ -27,24 +16,15 @@ def check(config: "Config") -> None:
         if not ok:
             raise UserError(message)
 
-    for key in ("total_steps", "seeds", "num_envs", "rollout_length", "updates_per_collect", "batch_size",
-                "n_step", "replay_capacity", "learning_starts", "eval_episodes", "keep_checkpoints"):  # fmt: skip
-        need(getattr(config, key) >= 1, f"{key}={getattr(config, key)}: must be at least 1")
-    need(0 <= config.seed < 2**31, f"seed={config.seed}: must be between 0 and {2**31 - 1}")
-    need(config.log_every is None or config.log_every >= 1, f"log_every={config.log_every}: must be positive")
-    for key in ("eval_every", "checkpoint_every"):
-        value = getattr(config, key)
-        need(value is None or value >= 0, f"{key}={value}: must not be negative")
+    _check_bounds("", config)
+    need(config.out != "", "out=: must name a directory")
     least = config.normalize_least_deviation
-    need(0 <= least < math.inf, f"normalize_least_deviation={least}: must not be negative")
     need(
         not least or config.normalize_observations,
         f"normalize_least_deviation={least} goes with normalize_observations=true",
     )
     diagnostics = config.diagnostics
-    for key in ("q_bias_rollouts", "q_bias_steps"):
-        value = getattr(diagnostics, key)
-        need(value >= 1, f"diagnostics.{key}={value}: must be at least 1")
+    _check_bounds("diagnostics.", diagnostics)
     need(
         not (diagnostics.q_bias and config.eval_every == 0),
         "diagnostics.q_bias=true measures at evaluations, and eval_every=0 means none: give eval_every=, in env steps",
@@ -52,7 +32,6 @@ def check(config: "Config") -> None:
     for name, team in {"algo": config.algo, "adversary": config.adversary}.items():
         if team is not None:
             _check_team(name, team, config.updates_per_collect, need)
-    _check_choices("", config, need)
     collect = config.num_envs * config.rollout_length
     need(
         config.batch_size <= config.replay_capacity,
@@ -81,41 +60,32 @@ def check(config: "Config") -> None:
 
 
 def _check_team(name: str, team: "AlgoConfig", updates: int, need: Any) -> None:
-    for key in ("num_critics", "policy_delay"):
-        need(getattr(team, key) >= 1, f"{name}.{key}={getattr(team, key)}: must be at least 1")
-    need(team.critic_atoms >= 2, f"{name}.critic_atoms={team.critic_atoms}: must be at least 2")
+    _check_bounds(f"{name}.", team)
+    need(
+        updates % team.policy_delay == 0 or team.policy_delay % updates == 0,
+        f"updates_per_collect={updates} is not a multiple of {name}.policy_delay={team.policy_delay} (nor divides it)",
+    )
+    if isinstance(team.exploration_noise, tuple):
+        low, high = team.exploration_noise
+        need(low <= high, f"{name}.exploration_noise=[{low},{high}]: a range [low,high] must not end below its start")
     need(
         team.critic_head != "categorical" or team.critic_range is not None,
         f"{name}.critic_head=categorical needs the range of returns: {name}.critic_range=[low,high]",
     )
     if team.critic_range is not None:
         first, last = team.critic_range
-        text = f"{name}.critic_range={list(team.critic_range)}"
-        need(-math.inf < first < last < math.inf, f"{text}: the first number must be below the second, both finite")
-    need(
-        updates % team.policy_delay == 0 or team.policy_delay % updates == 0,
-        f"updates_per_collect={updates} is not a multiple of {name}.policy_delay={team.policy_delay} (nor divides it)",
-    )
-    for key in ("actor_lr", "critic_lr", "max_grad_norm"):
-        value = getattr(team, key)
-        need(0 < value < math.inf, f"{name}.{key}={value}: must be positive")
-    for key in ("target_noise", "target_noise_clip", "logit_regularizer"):
-        value = getattr(team, key)
-        need(0 <= value < math.inf, f"{name}.{key}={value}: must not be negative")
-    noise = team.exploration_noise
-    low, high = noise if isinstance(noise, tuple) else (noise, noise)
-    shown = list(noise) if isinstance(noise, tuple) else noise
-    need(0 <= low < math.inf and high < math.inf, f"{name}.exploration_noise={shown}: must not be negative")
-    need(low <= high, f"{name}.exploration_noise={shown}: a range [low,high] must not end below its start")
-    need(0 < team.reward_scale < math.inf, f"{name}.reward_scale={team.reward_scale}: must be positive")
-    for key in ("gamma", "tau", "actor_average"):
-        value = getattr(team, key)
-        need(0 <= value <= 1, f"{name}.{key}={value}: must lie between 0 and 1")
-    need(all(width >= 1 for width in team.hidden), f"{name}.hidden={list(team.hidden)}: widths must be at least 1")
-    _check_choices(name + ".", team, need)
+        need(first < last, f"{name}.critic_range=[{first},{last}]: the first number must be below the second")
 
 
-def _check_choices(prefix: str, part: Any, need: Any) -> None:
-    for key, allowed in CHOICES.items():
-        value = getattr(part, key, allowed[0])
-        need(value in allowed, f"{prefix}{key}={value!r}: must be one of {', '.join(allowed)}")
+def _check_bounds(prefix: str, part: Any) -> None:
+    """Raise UserError for the first value that its field does not allow."""
+    for field in dataclasses.fields(part):
+        value, bounds = getattr(part, field.name), field.metadata["bounds"]
+        members = value if isinstance(value, tuple) else (value,)
+        for member in members:
+            if isinstance(member, int | float) and not isinstance(member, bool) and not bounds.admits(member):
+                shown = list(value) if isinstance(value, tuple) else value
+                each = "each " if isinstance(value, tuple) else ""
+                raise UserError(f"{prefix}{field.name}={shown}: {each}must {bounds.words()}")
+            if isinstance(member, str) and bounds.choices is not None and member not in bounds.choices:
+                raise UserError(f"{prefix}{field.name}={member!r}: must {bounds.words()}")

@@ -1,6 +1,8 @@
 """The run directory: settings, versions, the metrics table, checkpoints and pictures of one run."""
 
 import json
+import os
+import shlex
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,6 +16,7 @@ from matd3_jax.config.diff import differing, learning, text
 from matd3_jax.errors import UserError
 from matd3_jax.runs import metrics_table
 from matd3_jax.runs.metrics_table import MetricsTable
+from matd3_jax.runs.paths import check_directory
 from matd3_jax.runtime import files
 
 
@@ -32,13 +35,22 @@ class RunDirectory:
         self.q_bias = path / "q_bias.png"
         self.tensorboard = path / "tensorboard"
 
+    @staticmethod
+    def check_new(path: Path) -> None:
+        """Raise UserError where no directory for a run, or a sweep, can be made anew. Makes nothing."""
+        check_directory(path, "directory")
+        if "\\" in str(path.absolute()) and os.sep == "/":  # which Orbax would take for a slash
+            raise UserError(f"{str(path.absolute())!r}: checkpoints cannot be kept where a path has a backslash")
+        if path.exists():
+            raise UserError(_there(path))
+
     @classmethod
     def create(cls, path: Path, config: Config, machine: Mapping[str, Any]) -> "RunDirectory":
         """Make the directory. Raises UserError if it is there already or cannot be made."""
         try:
             path.mkdir(parents=True)
         except FileExistsError:
-            raise UserError(f"{path} is there already: choose another name=, or go on with resume={path}") from None
+            raise UserError(_there(path)) from None
         except OSError as error:
             raise UserError(f"cannot make the run directory {path}: {error.strerror}") from error
         run = cls(path)
@@ -102,11 +114,15 @@ class RunDirectory:
         return found if isinstance(found, dict) and "total_steps" in found else None
 
 
+def _there(path: Path) -> str:
+    return f"{path} is there already: choose another name=, or go on with {shlex.quote(f'resume={path}')}"
+
+
 def together(paths: Sequence[Path]) -> dict[str, np.ndarray]:
     """The metrics of runs that differ only in their seeds, as one table: columns [rows], by env step, then by seed.
 
     Columns that only some of the runs have (evaluations, say) are left out. How long runs go and what they leave behind
-    (`diff.RECORDS`) may differ, too: then not every seed has every step.
+    (`schema.RECORDS`) may differ, too: then not every seed has every step.
 
     Raises UserError where there is no run or no metrics yet, where runs differ otherwise, or two have the same seed.
     """

@@ -1,34 +1,59 @@
-"""Run directories named on the command line: `runs=A,B,C`."""
+"""Directories named on the command line: those of runs, `runs=A,B,C`, and those that a command is going to make."""
 
+import errno
 import glob
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from matd3_jax import lists
 from matd3_jax.errors import UserError
 
 
-def paths(arguments: Sequence[str], key: str = "runs") -> tuple[list[Path], list[str]]:
-    """Split off the run directories that `key` names: (the directories, the other arguments).
+def paths(texts: Sequence[str], key: str = "runs") -> tuple[Path, ...]:
+    """The run directories that the texts after `key=` name.
 
-    Takes `runs=A,B`, `runs=[A,B]`, several `runs=` (a shell makes them of `runs=runs/{a,b}`), and the wildcards of
-    shells, which stand for all run directories that match, in alphabetical order. What is between the commas is taken
-    as it is, so that directories may be called 1e3 or lr=0.01.
+    A text is `A,B` or `[A,B]`; a shell makes several of `runs=runs/{a,b}`. Wildcards of shells stand for all run
+    directories that match, in alphabetical order. What is between the commas is taken as it is, so that directories may
+    be called 1e3 or lr=0.01; one with a comma or brackets goes in quotation marks.
 
     Raises UserError where a name is empty, and where nothing matches.
     """
-    found, rest = [], []
-    for text in arguments:
-        if not text.startswith(f"{key}="):
-            rest.append(text)
-            continue
-        value = text.split("=", 1)[1].strip()
-        if value.startswith("[") and value.endswith("]"):
-            value = value[1:-1]
-        for name in (part.strip().strip("'\"") for part in value.split(",")):
+    found: list[Path] = []
+    for text in texts:
+        for name in lists.split(text):
             if not name:
-                raise UserError(f"cannot read {text!r}: write directories with commas between them, {key}=A,B")
+                raise UserError(f"cannot read {f'{key}={text}'!r}: write directories with commas between, {key}=A,B")
             found += _matching(Path(name).expanduser(), key)
-    return found, rest
+    return tuple(found)
+
+
+def check_new_directory(path: Path, key: str) -> None:
+    """`check_directory`, and raise UserError where something is in it already."""
+    check_directory(path, key)
+    if path.is_dir() and any(path.iterdir()):
+        raise UserError(f"{key}={path}: something is there already; choose another directory")
+
+
+def check_directory(path: Path, key: str) -> None:
+    """Raise UserError where nothing can be written into the directory `path`, which need not be there. Makes nothing.
+
+    Args:
+        key: of the option that names it, for the message.
+    """
+    try:
+        if path.exists() and not path.is_dir():
+            raise UserError(f"{key}={path}: cannot make this directory: a file has this name")
+        above = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
+        longest = os.pathconf(above, "PC_NAME_MAX") if hasattr(os, "pathconf") else 255
+        if any(len(os.fsencode(name)) > longest for name in path.absolute().relative_to(above).parts):
+            raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
+    except OSError as error:
+        raise UserError(f"{key}={path}: cannot make this directory: {error.strerror}") from error
+    if not above.is_dir():
+        raise UserError(f"{key}={path}: cannot make this directory: {above} is a file")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise UserError(f"{key}={path}: cannot make this directory: {above} is not writable")
 
 
 def _matching(path: Path, key: str) -> list[Path]:

@@ -15,10 +15,6 @@ KEYS = ("coordinator_address", "num_processes", "process_id")
 START_SECONDS = 300
 """How long processes wait for each other at the start."""
 
-HELP = """several processes (docs/performance.md): SLURM's are found, otherwise start each of N processes with
-  coordinator_address=HOST:PORT   where process 0 runs, and a port that is free there
-  num_processes=N process_id=I    I from 0 to N-1"""
-
 
 class Cluster(NamedTuple):
     """What `jax.distributed.initialize` needs to know."""

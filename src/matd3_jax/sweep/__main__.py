@@ -1,6 +1,6 @@
 """`python -m matd3_jax.sweep`: train many settings, and rank them."""
 
-from matd3_jax.cli import command, sweep
+from matd3_jax.cli import command
 
 if __name__ == "__main__":
-    command.run(sweep.main)
+    command.run_named("sweep")

@@ -9,6 +9,7 @@ from typing import Any
 
 from matd3_jax import config as configuration
 from matd3_jax.config import HYPER_PARAMS, AlgoConfig, Config
+from matd3_jax.config.schema import UNSHARED
 from matd3_jax.errors import UserError
 
 
@@ -28,9 +29,8 @@ def program(config: Config) -> str:
 
 
 def bare(config: Config) -> Config:
-    """The settings without seeds and places: equal for runs that differ in nothing else."""
-    places = {"name": None, "out": "", "checkpoint_every": None, "keep_checkpoints": 1, "tensorboard": False}
-    return dataclasses.replace(config, seed=0, seeds=1, **places)  # type: ignore[arg-type]
+    """The settings without `UNSHARED` (seeds, places), which are None: equal for runs that differ in nothing else."""
+    return dataclasses.replace(config, **dict.fromkeys(UNSHARED))  # type: ignore[arg-type]
 
 
 def missing(config: Config, existing: Mapping[str, Config]) -> tuple[list[str], list[int]]:

@@ -5,6 +5,7 @@
 """
 
 import dataclasses
+import re
 import runpy
 import subprocess
 import sys
@@ -53,17 +54,24 @@ def launch(folder: Path, pieces: int, launcher: str, options: Sequence[str]) -> 
         options: "launcher.KEY=value", the launcher's own.
     """
     folder = folder.resolve()
-    command = [sys.executable, "-m", "matd3_jax.sweep.launcher", "--multirun", f"sweep='{folder}'"]
+    command = [sys.executable, "-m", "matd3_jax.sweep.launcher", "--multirun", f"sweep={_quoted(folder)}"]
     command += [f"piece={','.join(map(str, range(pieces)))}", f"hydra/launcher={launcher}"]
-    command += [f"hydra.sweep.dir='{folder / 'jobs'}'", "hydra.sweep.subdir=${piece}"]
+    command += [f"hydra.sweep.dir={_quoted(folder / 'jobs')}", "hydra.sweep.subdir=${piece}"]
     command += [f"hydra.{option}" for option in options]
     return subprocess.run(command).returncode
+
+
+def _quoted(path: Path) -> str:
+    """A path as a string in Hydra's grammar."""
+    text = re.sub(r"(\\*)'", r"\1\1\'", str(path))
+    text = re.sub(r"(\\+)$", r"\1\1", text)
+    return "'" + re.sub(r"(\\*)\$\{", r"\1\1\${", text) + "'"
 
 
 @hydra.main(version_base=None, config_path=None, config_name="matd3_jax_job")
 def job(config: Job) -> int:
     """Train one piece: `python -m matd3_jax.sweep` in this process."""
-    sys.argv = ["matd3_jax.sweep", f"resume='{config.sweep}'", f"piece={config.piece}"]
+    sys.argv = ["matd3_jax.sweep", f"resume={config.sweep}", f"piece={config.piece}"]
     try:
         runpy.run_module("matd3_jax.sweep", run_name="__main__", alter_sys=True)
     except SystemExit as end:

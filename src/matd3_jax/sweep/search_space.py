@@ -113,7 +113,7 @@ def _axis(text: str, override: Override) -> Axis:
     if isinstance(value, IntervalSweep):
         return _interval(text, key, value)
     if isinstance(value, Glob):
-        names = config.known_names("algo" if key == "adversary" else key)
+        names = config.known_names(key)
         if not names:
             raise UserError(f"{text!r}: glob() chooses among files, for {', '.join(config.GROUPS)}")
         values = [n for n in names if any(fnmatch.fnmatch(n, p) for p in value.include)]

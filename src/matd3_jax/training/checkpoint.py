@@ -6,11 +6,14 @@ A checkpoint appears under its name only when it is whole. The replay is written
 never stands in memory twice. What some processes wrote any other number of them can read.
 """
 
+import contextlib
+import glob
 import hashlib
 import json
 import logging
 import shutil
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -56,16 +59,16 @@ def save(
     processes.barrier()
     written = []
     first, last = max(share.first, wanted.start), min(share.last, wanted.stop)
-    with ocp.StandardCheckpointer() as checkpointer:
+    with _without_wildcards(partial_) as there, ocp.StandardCheckpointer() as checkpointer:
         if first < last:
             written.append(partial_ / "state")
             if last - first < wanted.stop - wanted.start:
                 written[0] /= str(first - wanted.start)
             own = slice(first - share.first, last - share.first)
-            checkpointer.save(written[0], _leaves(trainer, state, own))
+            checkpointer.save(there / written[0].relative_to(partial_), _leaves(trainer, state, own))
         for seed, rows in _replay_rows(trainer, state) if seeds is None else ():
             written.append(partial_ / "replay" / str(share.first + seed))
-            checkpointer.save(written[-1], {"rows": rows})
+            checkpointer.save(there / written[-1].relative_to(partial_), {"rows": rows})
             checkpointer.wait_until_finished()
     parts = processes.collect(json.dumps(_checksums(partial_, written)).encode())
     if processes.first:
@@ -76,6 +79,19 @@ def save(
         for old in steps(folder)[:-keep]:
             shutil.rmtree(folder / str(old))
     return final
+
+
+@contextlib.contextmanager
+def _without_wildcards(folder: Path) -> Iterator[Path]:
+    """`folder` by a path that a pattern matches literally: Orbax looks for the files that it has written by a pattern
+    made of their path, and would leave a checkpoint that cannot be read where a directory is called `[1]`."""
+    if glob.escape(str(folder)) == str(folder):
+        yield folder
+        return
+    with tempfile.TemporaryDirectory() as place:
+        link = Path(place) / "checkpoint"
+        link.symlink_to(folder, target_is_directory=True)
+        yield link
 
 
 def steps(folder: Path) -> list[int]:

@@ -28,6 +28,8 @@ from matd3_jax.training.schedule import Schedule
 Row = dict[str, np.ndarray]
 """Columns of the metrics table for one interval: each [seeds]; "step" and "seed" among them."""
 
+LEARNING_COLUMNS = ("critic_loss", "q_value", "actor_loss")
+"""Of each agent; means over the updates of an interval."""
 
 EVALUATION_SPACING = 4
 """Env steps of training, at least, for each env step of an evaluation, by default. Evaluations cost no updates: they
@@ -186,11 +188,22 @@ class TrainingSession:
         for i, agent in enumerate(self.layout.agents):
             row[f"{agent}_return"] = returns[:, i]
         losses = metrics.update._asdict() if metrics.update is not None else {}
-        for name in ("critic_loss", "q_value", "actor_loss"):
+        for name in LEARNING_COLUMNS:
             values = np.asarray(losses[name], np.float64)[:seeds].mean(axis=1) if losses else None
             for i, agent in enumerate(self.layout.agents):
                 row[f"{agent}_{name}"] = np.full(seeds, np.nan) if values is None else values[:, i]
         return row
+
+    @property
+    def columns(self) -> list[str]:
+        """The names of the metrics table's columns, in their order."""
+        agents = self.layout.agents
+        names = ["step", "seed", "updates", "episodes", "episode_length"]
+        names += [f"return_{team}" for team in dict.fromkeys(self.layout.teams)]
+        names += [f"{agent}_return" for agent in agents]
+        names += [f"{agent}_{name}" for name in LEARNING_COLUMNS for agent in agents]
+        names += self.evaluation_columns(None)
+        return names + (list(overestimation.columns(agents, None, 0)) if self.config.diagnostics.q_bias else [])
 
     def team_weights(self, team: str) -> np.ndarray:
         """Weights [agents] of the agents' returns in the number reported for a team (`Environment.return_weights`)."""

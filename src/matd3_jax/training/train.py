@@ -8,6 +8,7 @@ import numpy as np
 
 from matd3_jax import config as configuration
 from matd3_jax.config import Config
+from matd3_jax.config.schema import TEXTS
 from matd3_jax.envs.check import check
 from matd3_jax.envs.environment import Environment
 from matd3_jax.runtime import devices
@@ -58,7 +59,8 @@ def train(
     own = None if isinstance(env, str) else env
     if own is not None:
         check(own)
-    chosen = [f"algo={algo}", *(f"{key}={_text(value)}" for key, value in settings.items()), *overrides]
+    given = {key: value for key, value in settings.items() if value is not None or key not in TEXTS}
+    chosen = [f"algo={algo}", *(f"{key}={_text(value)}" for key, value in given.items()), *overrides]
     config = configuration.load(chosen if own is not None else [f"env={env}", *chosen])
     if own is not None:
         config = dataclasses.replace(config, env={"name": type(own).__name__})

@@ -1,0 +1,28 @@
+"""Options that most benchmarks have, and their report."""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from matd3_jax.cli.options import option, others
+
+
+@dataclasses.dataclass(frozen=True)
+class Reported:
+    """A benchmark that can leave its numbers in a file."""
+
+    out: Path | None = option("the report, as JSON", default=None, metavar="FILE.json", new_file=True)
+
+    def write(self, report: Mapping[str, Any]) -> None:
+        """Write the report, if a file is wanted."""
+        if self.out is not None:
+            self.out.write_text(json.dumps(report, indent=1) + "\n")
+
+
+@dataclasses.dataclass(frozen=True)
+class OfARun(Reported):
+    """A benchmark that takes settings of a run."""
+
+    overrides: tuple[str, ...] = others("any other setting of the run, as matd3_jax.train takes it")

@@ -1,0 +1,244 @@
+"""What every command takes: its options, usage and examples. Imports nothing heavy, so that --help is quick."""
+
+import dataclasses
+import textwrap
+from pathlib import Path
+
+from matd3_jax import groups
+from matd3_jax.cli.options import WIDTH, Command, flag, option, others
+from matd3_jax.runs.paths import paths
+from matd3_jax.runtime import slurm
+
+LARGEST_SEED = 2**31 - 1
+
+
+@dataclasses.dataclass(frozen=True)
+class OfProcesses:
+    """Options of commands that several processes may share; `runtime.slurm` checks them together."""
+
+    coordinator_address: str | None = option(
+        "of several processes (SLURM's are found by themselves): where process 0 runs, and a free port",
+        default=None, metavar="HOST:PORT",
+    )  # fmt: skip
+    num_processes: str | None = option("how many processes there are", default=None, metavar="N")
+    process_id: str | None = option("which of them this one is, from 0 to N-1", default=None, metavar="I")
+
+    def processes(self) -> dict[str, str]:
+        """Those that are given, as `multihost.start` takes them."""
+        found = {name: getattr(self, name) for name in slurm.KEYS}
+        return {name: text for name, text in found.items() if text is not None}
+
+
+@dataclasses.dataclass(frozen=True)
+class Train(OfProcesses):
+    """Train with every seed, and leave a run directory; or go on with one (resume=)."""
+
+    resume: Path | None = option("go on with this run; total_steps= may be raised", default=None, metavar="RUN_DIR")
+    checkpoint: int | None = option(
+        "with resume: go on from the checkpoint of this env step", default=None, least=0, otherwise="the last"
+    )
+    cfg: bool = flag("--cfg", "print the resolved settings and stop")
+    settings: tuple[str, ...] = others("a setting, in Hydra's grammar; name= and out= as typed")
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweep(OfProcesses):
+    """Train all combinations of settings with several values, with `seeds` seeds each, and rank them.
+
+    Any setting of matd3_jax.train may have several values: a list algo.lr=0.01,0.003,0.001, choice(...), range(1,4), or
+    for files glob(*). With samples=N so many random draws are trained, which may come from intervals:
+    algo.lr='interval(1e-4,1e-2)' (log scale where both ends are positive; tag(uniform,interval(...))).
+
+    Leaves a ranked table, table.csv, seeds.csv and sweep.png in its directory; every run is a run directory in runs/,
+    for matd3_jax.evaluate, matd3_jax.render and the others.
+    """
+
+    samples: int | None = option("draw so many settings at random", default=None, least=1, otherwise="the whole grid")
+    sample_seed: int = option("of the draws", default=0, least=0)
+    metric: str | None = option(
+        "column of the metrics table, by which settings are ranked",
+        default=None, metavar="COLUMN", otherwise="return_agents",
+    )  # fmt: skip
+    memory: float | None = option(
+        "that each process may use at once", default=None, metavar="GB", unit="gigabytes", above=0,
+        otherwise="what is free",
+    )  # fmt: skip
+    train: bool = option("false: only plan, and say how to train the pieces", default=True)
+    launcher: str | None = option(
+        "train the pieces as jobs of a Hydra launcher, e.g. submitit_slurm", default=None, metavar="NAME"
+    )
+    name: str | None = option("of the sweep's directory", default=None, metavar="NAME", otherwise="made from the time")
+    out: Path = option("where the sweep's directory goes", default=Path("runs"))
+    resume: Path | None = option("go on with this sweep", default=None, metavar="SWEEP_DIR")
+    piece: int | None = option("with resume: train this piece alone", default=None, metavar="K", least=0)
+    launcher_options: tuple[str, ...] = others("an option of the launcher", prefix="launcher.")
+    settings: tuple[str, ...] = others("a setting, with one value or several")
+
+
+@dataclasses.dataclass(frozen=True)
+class OfOneRun:
+    """Options of commands that play with the policies of one run."""
+
+    run: Path = option("the run directory", metavar="RUN_DIR")
+    checkpoint: int | None = option("the checkpoint of this env step", default=None, least=0, otherwise="the last")
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluate(OfOneRun):
+    """Play whole episodes with every seed's policies, deterministic (no noise) and sampled (as in training).
+
+    With averaged actors (algo.actor_average) also deterministic with the online ones. Prints means over the episodes,
+    and writes every number to RUN_DIR/evaluation.csv.
+    """
+
+    episodes: int = option("episodes of each seed", default=100, least=1)
+    seed: int = option("of the start states", default=0, least=0, most=LARGEST_SEED)
+
+
+@dataclasses.dataclass(frozen=True)
+class Render(OfOneRun):
+    """Play one evaluation episode with the policies of one seed and draw it, each picture with env step and return."""
+
+    out: Path | None = option(
+        "a name that ends with .gif, or with .mp4 (needs ffmpeg)", default=None, new_file=True,
+        otherwise="RUN_DIR/episode.gif",
+    )  # fmt: skip
+    seed: int | None = option("which of the run's seeds", default=None, least=0, otherwise="the first")
+    episode: int = option("which of the episodes that `evaluate` plays", default=0, least=0, most=9999)
+    deterministic: bool = option("false: with exploration noise, as in training", default=True)
+    max_steps: int | None = option(
+        "stop after so many", default=None, unit="env steps", least=1, otherwise="the whole episode"
+    )
+    every: int | None = option(
+        "draw every n-th env step", default=None, least=1, otherwise="the least that makes some 200 at most"
+    )
+    size: int = option("longer side", default=400, unit="pixels", least=100, most=2000)
+    fps: int | None = option("pictures a second", default=None, least=1, most=100, otherwise="10, of robots 20")
+
+
+@dataclasses.dataclass(frozen=True)
+class CrossPlay:
+    """Play the agents of every run against the adversaries of every run, and print the matrix of mean returns.
+
+    All play in the same environment and from the same start states. Means have 95 % intervals over seeds. Pairs that
+    were trained together (same run, same seed: "own") stand apart from all others.
+    """
+
+    runs: tuple[Path, ...] = option(
+        "run directories, with commas or wildcards (runs='runs/push-*'); one alone meets itself",
+        metavar="A,B,C", read=paths,
+    )  # fmt: skip
+    pairing: str = option(
+        "every seed with every seed, or the first of one run with the first of the other, ...",
+        default="all", choices=("all", "matched"),
+    )  # fmt: skip
+    episodes: int = option("whole episodes of each pair of seeds", default=100, least=1, most=10**6)
+    deterministic: bool = option("true: no noise at all; false: sampled, as in training", default=False)
+    seed: int = option("of the start states, as in `evaluate`", default=0, least=0, most=LARGEST_SEED)
+    checkpoint: int | None = option(
+        "the checkpoint of this env step, of all runs", default=None, least=0, otherwise="the last of each"
+    )
+    out: Path | None = option(
+        "a directory that is not there yet, or empty", default=None, otherwise="crossplay/ENV-TIME"
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Plot:
+    """Draw a learning curve for each setting: runs whose settings differ only in their seeds are one curve.
+
+    Runs that have not ended are drawn as far as they are.
+    """
+
+    runs: tuple[Path, ...] = option(
+        "run directories; also [A,B], and patterns: runs='runs/sweep/*'", metavar="A,B", read=paths
+    )
+    y: tuple[str, ...] = option(
+        "columns of metrics.csv, a panel for each", default=("return_agents",), metavar="COLUMN,COLUMN,..."
+    )
+    x: str = option("episodes: ended so far", default="step", choices=("step", "episodes", "updates"))
+    out: Path = option("a name that ends with .png, .pdf or .svg", default=Path("plot.png"), new_file=True)
+    average: str = option("over seeds; iqm: the interquartile mean", default="mean", choices=("mean", "median", "iqm"))
+    interval: str | None = option(
+        "95 % by Student's t or by the bootstrap, or a standard deviation to both sides",
+        default=None, choices=("t", "bootstrap", "sd", "none"), otherwise="t for the mean, bootstrap for the others",
+    )  # fmt: skip
+    window: int | None = option(
+        "running mean over so many (the paper's: 1000)", default=None, unit="episodes", least=1,
+        otherwise="the rows as they are",
+    )  # fmt: skip
+    labels: tuple[str, ...] | None = option(
+        "of the curves, in the order of the runs; in quotation marks with commas", default=None,
+        otherwise="where the settings differ",
+    )  # fmt: skip
+    title: str | None = option("over the figure", default=None, otherwise="what all runs have in common")
+    each: bool = option("true: every seed, too, thin", default=False)
+
+
+# ---- the commands ----------------------------------------------------------------------------------------------------
+
+
+def _settings() -> str:
+    """What train's help says of settings, from the files of settings."""
+    comments = (groups.FOLDER / "config.yaml").read_text().split("\n\n", 2)[2]
+    names = {"environments:": "env", "algorithms:": "algo", "recipes:": "recipe"}
+    lines = [f"{title:<14}{', '.join(groups.known_names(group))}" for title, group in names.items()]
+    wrapped = [textwrap.fill(line, WIDTH, subsequent_indent=" " * 14) for line in lines]
+    return (
+        "\n".join(wrapped) + " (of robots; fast by default)\n\n"
+        "settings and their defaults (those of a file: env.KEY=value, algo.KEY=value, adversary.KEY=value); robots "
+        f"bring others\nalong, which --cfg env=ant prints:\n\n{comments.strip()}"
+    )
+
+
+def _python(name: str) -> str:
+    return f"python -m matd3_jax.{name}"
+
+
+TRAIN = Command(
+    _python("train"), Train, more=_settings,
+    usage=(
+        "[env=NAME] [algo=NAME] [adversary=NAME] [recipe=NAME] [key=value ...]",
+        "resume=RUN_DIR [checkpoint=STEP] [total_steps=N]",
+        "--cfg [key=value ...]",
+    ),
+    examples=(
+        "python -m matd3_jax.train env=simple_tag algo=matd3 adversary=maddpg seeds=8",
+        "python -m matd3_jax.train env=ant seeds=6 name='first ant'",
+    ),
+)  # fmt: skip
+SWEEP = Command(
+    _python("sweep"), Sweep,
+    usage=(
+        "[env=NAME] [algo=NAME] [key=value ...] key=VALUES ... [option=value ...]",
+        "resume=SWEEP_DIR [piece=K] [metric=COLUMN]",
+    ),
+    examples=(
+        "python -m matd3_jax.sweep algo.lr=0.01,0.003,0.001 algo.policy_delay=1,2 seeds=4",
+        "python -m matd3_jax.sweep algo.lr='interval(1e-4,1e-2)' samples=16 seeds=4 memory=8",
+    ),
+)  # fmt: skip
+EVALUATE = Command(
+    _python("evaluate"), Evaluate, examples=("python -m matd3_jax.evaluate run=runs/first episodes=1000",)
+)
+RENDER = Command(
+    _python("render"), Render,
+    more="Robots need OpenGL, in software or not; MUJOCO_GL (egl, osmesa, glfw) in the environment chooses which.",
+    examples=("python -m matd3_jax.render run=runs/first out=first.mp4 seed=2",),
+)  # fmt: skip
+CROSSPLAY = Command(
+    _python("crossplay"), CrossPlay, examples=("python -m matd3_jax.crossplay runs='runs/push-*' pairing=matched",)
+)
+PLOT = Command(
+    _python("plot"), Plot,
+    examples=("python -m matd3_jax.plot runs='runs/sweep/runs/*' y=return_agents,eval_return_agents average=iqm",),
+)  # fmt: skip
+
+COMMANDS: dict[str, Command] = {
+    "train": TRAIN,
+    "sweep": SWEEP,
+    "evaluate": EVALUATE,
+    "crossplay": CROSSPLAY,
+    "plot": PLOT,
+    "render": RENDER,
+}

@@ -1,0 +1,235 @@
+"""Reading settings: YAML files and overrides in Hydra's grammar into a checked `Config`, and back into YAML."""
+
+import copy
+import functools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_module
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, OverrideType, ValueType
+from hydra.errors import HydraException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from matd3_jax.config.coerce import typed
+from matd3_jax.config.schema import ADDED_LATER, RENAMED, TEXTS, AlgoConfig, Config, DiagnosticsConfig
+from matd3_jax.config.validate import check
+from matd3_jax.errors import OptionError, UserError, nearest
+from matd3_jax.groups import GROUPS, known_names
+from matd3_jax.runtime import files
+
+ROBOT_RECIPE = "fast"
+"""What robots train by unless a recipe is given, on every machine."""
+
+
+def load(overrides: Sequence[str] = (), known: Sequence[str] = ()) -> Config:
+    """The configuration that overrides in Hydra's grammar (`env=simple_tag`, `algo.lr=0.003`) give.
+
+    Robots take their settings from a recipe (`ROBOT_RECIPE` unless one is given), all others have the paper's.
+    `TEXTS` (name= and out=) are taken as they are typed.
+
+    Args:
+        known: keys that the caller takes itself, for what an error message says about an unknown one.
+
+    Raises UserError, naming the key and the nearest valid ones, for whatever is not known or not possible.
+    """
+    parsed = parse(overrides)
+    if any(o.key_or_group == "schedule" for o in parsed):
+        raise UserError("there is no key 'schedule' any more: a robot's recipe has it (recipe=fast, paper or wide)")
+    for group, noun in GROUPS.items():
+        valid = known_names(group)
+        for value in (o.value() for o in parsed if o.key_or_group == group):
+            if value not in valid:
+                raise UserError(f"no {noun} is called {value!r}; {nearest(value, valid)}")
+    # Files first: Hydra wants them chosen before their values are changed.
+    chosen = [o for o in parsed if o.key_or_group in GROUPS]
+    values = [o for o in parsed if o.key_or_group not in GROUPS and not _is_text(o)]
+    lines = [f"{o.key_or_group}={o.value()}" for o in chosen if o.key_or_group in ("env", "algo")]
+    recipe = [o.value() for o in chosen if o.key_or_group == "recipe"]
+    adversary = [o.value() for o in chosen if o.key_or_group == "adversary"]
+    if not adversary and any(o.key_or_group.startswith("adversary.") for o in values):
+        # The same algorithm with other values: start from all that algo= and algo.* say.
+        adversary = [o.value() for o in chosen if o.key_or_group == "algo"] or ["matd3"]
+        values = [_renamed(o) for o in values if o.key_or_group.startswith("algo.")] + values
+    if adversary:
+        lines.append(f"+algo@adversary={adversary[-1]}")
+    try:
+        tree = _files(tuple(lines))
+        if "robot" in tree:
+            lines.append(f"+recipe={recipe[-1] if recipe else ROBOT_RECIPE}")
+        elif recipe and recipe[-1] != "paper":
+            raise UserError(f"recipe={recipe[-1]} is for robots; {tree.env.name} has the paper's settings only")
+        tree = _files(tuple(lines))
+        _check_keys(tree, values, known)
+        tree = copy.deepcopy(_files(tuple(lines)))
+        for override in values:
+            if override.is_add() and not override.is_force_add():
+                raise UserError(f"cannot add {_line(override)!r}: the key is there, write it without the +")
+            OmegaConf.update(tree, override.key_or_group, override.value())
+        resolved = OmegaConf.to_container(tree, resolve=True, throw_on_missing=True)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(_one_line(error)) from error
+    assert isinstance(resolved, dict)
+    resolved["env"] = _with_engine(resolved["env"])
+    for key in ("robot", "per_algorithm"):  # what only serves the files
+        resolved.pop(key, None)
+    resolved.update((o.key_or_group, _writable(o)) for o in parsed if _is_text(o))
+    return from_dict(resolved)  # type: ignore[arg-type]
+
+
+def parse(overrides: Sequence[str], sweep: bool = False) -> list[Override]:
+    """Overrides in Hydra's grammar, `TEXTS` as they are typed; `sweep`: also with several values.
+
+    Raises UserError where one is malformed.
+    """
+    parsed = []
+    for text in overrides:
+        key, sign, value = text.partition("=")
+        if sign and key in TEXTS:
+            parsed.append(Override(OverrideType.CHANGE, key, ValueType.ELEMENT, value, input_line=text))
+            continue
+        try:
+            override = _parser().parse_override(text)
+        except (HydraException, OverrideParseException) as error:
+            example = "key=value, for instance algo.lr=0.003" + (" or algo.lr=0.01,0.003" if sweep else "")
+            raise UserError(f"cannot read {text!r}: write {example}") from error
+        if override.is_delete() or override.is_sweep_override() and not sweep:
+            raise UserError(f"cannot take {text!r} here: write key=value with one value (several: matd3_jax.sweep)")
+        parsed.append(override)
+    return parsed
+
+
+@functools.cache
+def _parser() -> OverridesParser:
+    return OverridesParser.create()
+
+
+@functools.cache
+def _files(lines: tuple[str, ...]) -> DictConfig:
+    """What the files say that `lines` choose; not to be changed."""
+    with initialize_config_module("matd3_jax.config", version_base=None):
+        return compose("config", list(lines))
+
+
+def read(path: Path) -> Config:
+    """The configuration that `write` left. Raises UserError if it cannot be read."""
+    try:
+        found = OmegaConf.to_container(OmegaConf.load(path))
+        assert isinstance(found, dict)
+        values = _with_defaults(renamed(found), ADDED_LATER)
+        if "physics" in values["env"]:
+            from matd3_jax.envs.robots.engines.engine import RENAMED
+
+            physics = values["env"]["physics"]
+            values["env"] = {**values["env"], "physics": RENAMED.get(physics, physics)}
+        return from_dict(values)
+    except (OSError, AssertionError, ValueError, OmegaConfBaseException) as error:
+        raise UserError(f"cannot read the configuration {path}: {_one_line(error)}") from error
+
+
+def renamed(values: Mapping[Any, Any]) -> dict[Any, Any]:
+    """Plain settings with the names that keys have now, in their groups, too."""
+    return {
+        RENAMED.get(key, key): renamed(value) if isinstance(value, Mapping) else value for key, value in values.items()
+    }
+
+
+def text(config: Config) -> str:
+    """Every resolved value, as YAML."""
+    return OmegaConf.to_yaml(OmegaConf.create(config.to_dict()))
+
+
+def write(config: Config, path: Path) -> None:
+    """Leave every resolved value in a YAML file."""
+    files.write_text(path, text(config))
+
+
+def from_dict(values: Mapping[str, Any]) -> Config:
+    """A checked configuration from plain values. Raises UserError."""
+    rest = dict(values)
+    env = rest.pop("env")
+    algo = typed(AlgoConfig, {k: v for k, v in rest.pop("algo").items() if k != "lr"}, "algo.")
+    adversary = rest.pop("adversary", None)
+    if adversary is not None:
+        adversary = typed(AlgoConfig, {k: v for k, v in adversary.items() if k != "lr"}, "adversary.")
+    diagnostics = rest.pop("diagnostics", None)
+    if not isinstance(diagnostics, Mapping):
+        raise UserError(f"diagnostics={diagnostics!r}: must be a group of keys, for instance diagnostics.q_bias=true")
+    diagnostics = typed(DiagnosticsConfig, diagnostics, "diagnostics.")
+    groups = {"env": env, "algo": algo, "adversary": adversary, "diagnostics": diagnostics}
+    config = typed(Config, {**rest, **groups}, "")
+    check(config)
+    return config
+
+
+def _with_engine(env: Mapping[str, Any]) -> Mapping[str, Any]:
+    """A robot's options with the engine that this machine takes for `physics: auto`: a run keeps it wherever it is
+    resumed."""
+    if "physics" not in env:
+        return env
+    from matd3_jax.envs.robots.engines import engine
+
+    try:
+        return {**env, "physics": engine.resolve(env["physics"])}
+    except OptionError as error:
+        raise UserError(f"env.{error}") from error
+
+
+def _with_defaults(found: Mapping[Any, Any], defaults: Mapping[str, Any]) -> dict[Any, Any]:
+    """`found` with the keys that it lacks, also within its groups."""
+    values = {**defaults, **found}
+    for key, default in defaults.items():
+        if isinstance(default, Mapping) and isinstance(values[key], Mapping):
+            values[key] = {**default, **values[key]}
+    return values
+
+
+def _check_keys(tree: DictConfig, values: Sequence[Override], known: Sequence[str]) -> None:
+    """Raise UserError for a value whose key the configuration does not have; `known`: others that there are."""
+    for override in values:
+        node, path = tree, override.key_or_group.split(".")
+        for depth, name in enumerate(path):
+            if not isinstance(node, DictConfig) or name not in node:
+                prefix = ".".join(path[:depth])
+                keys = [str(key) for key in node] if isinstance(node, DictConfig) else []
+                keys += known if not depth else []
+                # A key typed without its group, or in the wrong one, is a common slip: look there, too.
+                groups = ("algo", "env", "diagnostics")
+                elsewhere = [f"{group}.{name}" for group in groups if name in tree.get(group, {})]
+                elsewhere += [name] if depth and name in tree else []
+                now = RENAMED.get(name)
+                hint = f"did you mean {' or '.join(map(repr, elsewhere))}?" if elsewhere else nearest(name, keys)
+                hint = f"it is called {'.'.join([*path[:-1], now])!r} now" if now else hint
+                raise UserError(
+                    f"there is no key {override.key_or_group!r}{f' (in {prefix})' if prefix else ''}; {hint}"
+                )
+            node = node[name] if OmegaConf.is_config(node) and not OmegaConf.is_missing(node, name) else node
+
+
+def _is_text(override: Override) -> bool:
+    return override.key_or_group in TEXTS and override.type == OverrideType.CHANGE
+
+
+def _writable(override: Override) -> str:
+    """A text. Raises UserError where OmegaConf could not write it into a file: an interpolation without an end."""
+    try:
+        OmegaConf.create({override.key_or_group: override.value()})
+    except OmegaConfBaseException as error:
+        raise UserError(f"{_line(override)}: must not hold an unfinished ${{") from error
+    return str(override.value())
+
+
+def _line(override: Override) -> str:
+    assert override.input_line is not None
+    return override.input_line
+
+
+def _renamed(override: Override) -> Override:
+    line = _line(override)
+    return _parser().parse_override(line.replace("algo.", "adversary.", 1))
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
