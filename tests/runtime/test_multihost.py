@@ -302,7 +302,7 @@ def test_two_processes_make_the_run_of_one(alone, tmp_path, quickly_compiled):
             worker.kill()
     assert [worker.returncode for worker in workers] == [128 + signal.SIGTERM] * 2, said
     run = tmp_path / "run"
-    assert f"stopped by SIGTERM at env step 500; go on with: python -m matd3_jax.train resume={run}" in said[0]
+    assert f"stopped by SIGTERM at env step 500; resume with: python -m matd3_jax.train resume={run}" in said[0]
     assert "run directory" not in said[1] and "%" not in said[1]
     machine = json.loads((run / "machine.json").read_text())
     assert [len(process["devices"]) for process in machine["processes"]] == [3, 1]
