@@ -61,7 +61,21 @@ def test_damage_is_left_out_and_counted(name):
 def test_intervals_that_not_all_seeds_have_are_no_columns_and_are_named():
     table = metrics_table.parse(b"".join([*LINES[:3], *LINES[4:6]]))  # 6500 without seed 0, 7000 without seed 1
     np.testing.assert_array_equal(table.columns()["step"], [650, 650])
-    assert table.missing([650, 6500, 7000, 7500], 2) == [6500, 7000, 7500]
+    assert table.gaps(650, 7000, 500, seeds=2) == [(650, 7000)]
+
+
+def test_gaps_are_named_and_other_intervals_are_none():
+    """Rows every 100 env steps, then, after the run was lengthened, every 150."""
+    steps = [50, 150, 250, 350, 500, 650, 800]
+
+    def gaps(steps, last=800):
+        rows = [[str(step), str(seed), "1"] for step in steps for seed in (0, 1)]
+        return metrics_table.MetricsTable(["step", "seed", "q"], rows, 0).gaps(50, last, 150, 2)
+
+    assert gaps(steps) == []
+    assert gaps([step for step in steps if step != 150]) == [(50, 250)]
+    assert gaps([step for step in steps if step not in (50, 500, 800)]) == [(0, 150), (350, 650), (650, 800)]
+    assert gaps([]) == [(0, 800)]
 
 
 def test_a_run_directory_cuts_and_goes_on(tmp_path):

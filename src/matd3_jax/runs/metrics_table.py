@@ -2,6 +2,7 @@
 
 import csv
 import io
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -28,12 +29,26 @@ class MetricsTable(NamedTuple):
         whole = [row for row in self.rows if len(seeds[row[0]]) == most]
         return {name: np.array([float(row[i]) for row in whole]) for i, name in enumerate(self.header)}
 
-    def missing(self, steps: Sequence[int], seeds: int) -> list[int]:
-        """Those of the env steps `steps` that not all of so many seeds have a row of."""
+    def gaps(self, first: int, last: int, interval: int, seeds: int) -> list[tuple[int, int]]:
+        """Pairs of env steps between which rows are missing: from the step of the last row before to the next.
+
+        A run that was lengthened has intervals of several lengths; a gap is longer than all that are usual.
+
+        Args:
+            first, last: the steps that the first and the last row should have.
+            interval: env steps between rows now.
+            seeds: how many there are; an interval that not all have a row of is missing.
+        """
         found: dict[int, int] = {}
         for row in self.rows:
             found[int(row[0])] = found.get(int(row[0]), 0) + 1
-        return [step for step in steps if found.get(step, 0) < seeds]
+        steps = sorted(step for step, count in found.items() if count >= seeds and first <= step <= last)
+        usual = max(interval, int(np.median(np.diff(steps))) if len(steps) > 1 else 0)
+        if not steps:
+            return [(0, last)]
+        gaps = [(0, steps[0])] if steps[0] > first else []
+        gaps += [(a, b) for a, b in itertools.pairwise(steps) if b - a > usual]
+        return gaps + ([(steps[-1], last)] if steps[-1] < last else [])
 
     def until(self, step: int) -> "MetricsTable":
         """The rows up to an env step."""

@@ -169,10 +169,11 @@ class Recorder:
         if table.damaged:
             plural = "s" * (table.damaged > 1)
             self.say(f"note: {directory.metrics} had {table.damaged} damaged line{plural}, left out now")
-        missing = table.missing(training.logged_steps(done), training.share.total)
-        if missing:
-            shown = ", ".join(f"{step:,}" for step in missing[:5]) + (", ..." if len(missing) > 5 else "")
-            self.say(f"note: {directory.metrics} lacks the rows of {len(missing)} logging intervals: env steps {shown}")
+        first, interval = training.trainer.warmup_steps, training.interval_steps
+        gaps = table.gaps(first, done, interval, training.share.total)
+        if gaps:
+            shown = ", ".join(f"{a:,} and {b:,}" for a, b in gaps[:3]) + (", ..." if len(gaps) > 3 else "")
+            self.say(f"note: {directory.metrics} lacks rows between env steps {shown}")
 
     def _to_the_end(
         self,

@@ -168,10 +168,10 @@ class TrainingSession:
         """Env steps of each seed so far."""
         return self.trainer.env_steps(int(state.rollouts))
 
-    def logged_steps(self, step: int) -> list[int]:
-        """The env steps up to `step` at which the metrics table has rows: after the warm-up and each interval."""
-        first, interval = self.trainer.warmup_steps, self.iterations_per_interval * self.trainer.iteration_steps
-        return list(range(first, step + 1, interval))
+    @property
+    def interval_steps(self) -> int:
+        """Env steps of each seed in a logging interval."""
+        return self.iterations_per_interval * self.trainer.iteration_steps
 
     def row(self, state: TrainState, metrics: Metrics) -> Row:
         """The interval's row of the metrics table for each seed."""
@@ -239,7 +239,7 @@ class TrainingSession:
 
     def evaluations_after(self, step: int) -> int:
         """How many evaluations are to come after the interval that ended at env step `step`."""
-        interval = self.iterations_per_interval * self.trainer.iteration_steps
+        interval = self.interval_steps
         ends = range(step, self.total_steps + interval, interval)
         return sum(map(self._due, ends[:-1], ends[1:]))
 

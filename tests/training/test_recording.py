@@ -1,0 +1,283 @@
+"""Every state that a stop, a kill or a damage leaves in a run directory leads on, and to the unbroken run's numbers."""
+
+import dataclasses
+import functools
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from checkpoint_arrays import leaves
+
+import matd3_jax
+from matd3_jax import config
+from matd3_jax.envs.environment import Environment
+from matd3_jax.envs.point_reach import PointReach
+from matd3_jax.errors import UserError
+from matd3_jax.runs import lock
+from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.training import checkpoint
+from matd3_jax.training.recording import Recorder
+
+SMALL = [
+    "env=point_reach", "algo=iddpg", "seeds=2", "total_steps=1200", "learning_starts=400", "num_envs=4",
+    "rollout_length=5", "batch_size=32", "replay_capacity=800", "algo.hidden=[8]", "log_every=200", "eval_every=400",
+    "eval_episodes=2", "checkpoint_every=400", "keep_checkpoints=9",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick(quick_jit):
+    """Every program of this module compiles with little optimization."""
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """An unbroken run."""
+    path = tmp_path_factory.mktemp("runs") / "whole"
+    Recorder().start(config.load(SMALL), path)
+    return path
+
+
+@pytest.fixture
+def copy(whole, tmp_path):
+    return shutil.copytree(whole, tmp_path / "run")
+
+
+def resume(path, **given):
+    """Resume and give what was said."""
+    said = []
+    Recorder(say=said.append).resume(path, **given)
+    return said
+
+
+def same(path, whole):
+    assert (path / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
+    found, wanted = leaves(path), leaves(whole)
+    assert found.keys() == wanted.keys()
+    for name in wanted:
+        np.testing.assert_array_equal(found[name], wanted[name], err_msg=name)
+    assert RunDirectory(path).summary() is not None and (path / "learning_curve.png").exists()
+
+
+def back_to(path, step):
+    """As a kill after the checkpoint of `step` leaves it."""
+    for later in checkpoint.steps(path / "checkpoints"):
+        if later > step:
+            shutil.rmtree(path / "checkpoints" / str(later))
+    for name in ("summary.json", "learning_curve.png"):
+        (path / name).unlink(missing_ok=True)
+
+
+def test_there_is_a_checkpoint_right_after_the_warm_up(whole):
+    first, *_ = checkpoint.steps(whole / "checkpoints")
+    with (whole / "metrics.csv").open() as file:
+        assert first == int(file.readlines()[1].split(",")[0])
+
+
+def test_killed_before_its_first_checkpoint(copy, whole):
+    shutil.rmtree(copy / "checkpoints")
+    (copy / "summary.json").unlink()
+    assert "no checkpoint yet: this run starts anew" in resume(copy)
+    same(copy, whole)
+
+
+def test_killed_before_anything_but_its_settings(copy, whole):
+    for path in copy.iterdir():
+        if path.name != "config.yaml":
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    resume(copy)
+    same(copy, whole)
+
+
+@pytest.mark.parametrize("left", ["nothing", "an empty summary", "half a summary"])
+def test_killed_after_its_last_checkpoint(copy, whole, left):
+    """The end can be made again: summary and curve."""
+    (copy / "learning_curve.png").unlink()
+    (copy / "summary.json").unlink()
+    if left != "nothing":
+        (copy / "summary.json").write_text("" if left == "an empty summary" else '{"total_steps": 12')
+    said = resume(copy)
+    assert any("has come to its end" in line for line in said) and said[-1].startswith("learning curve: ")
+    same(copy, whole)
+    with pytest.raises(UserError, match="raise total_steps="):
+        resume(copy)
+
+
+def test_an_older_checkpoint_sets_the_newer_ones_aside(copy, whole):
+    """Killed right after it was resumed from an old checkpoint, a run goes on from there, not from what it left."""
+    first, second, *later = checkpoint.steps(copy / "checkpoints")
+    (copy / "summary.json").unlink()
+
+    def kill(state, step):
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(checkpoint, "save", lambda *args, **kwargs: kill(*args[2:4]))
+        with pytest.raises(KeyboardInterrupt):
+            resume(copy, step=first)
+    assert checkpoint.steps(copy / "checkpoints") == [first]
+    said = resume(copy)
+    assert f"resumed from the checkpoint of env step {first:,}" in said
+    same(copy, whole)
+    assert not list((copy / "checkpoints").glob("*set_aside"))
+
+
+DAMAGES = {
+    "emptied": lambda data: b"",
+    "deleted": None,
+    "zeros at the end": lambda data: data + b"\0" * 100,
+    "a blank line": lambda data: data + b"\r\n",
+    "torn within a number": lambda data: data[: data.rfind(b"\n", 0, -2) + 3],
+    "rows missing": lambda data: b"".join(line for k, line in enumerate(data.splitlines(keepends=True)) if k != 3),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_damaged_metrics_table_leads_on_and_is_named(copy, whole, name):
+    back_to(copy, checkpoint.steps(copy / "checkpoints")[1])
+    table = copy / "metrics.csv"
+    if DAMAGES[name] is None:
+        table.unlink()
+    else:
+        table.write_bytes(DAMAGES[name](table.read_bytes()))
+    said = resume(copy)
+    notes = [line for line in said if line.startswith("note: ")]
+    lost = [line for line in notes if "lacks rows between" in line]
+    assert bool(lost) == (name in ("emptied", "deleted", "rows missing"))
+    assert any("damaged line" in line for line in notes) == (
+        name in ("zeros at the end", "a blank line", "torn within a number")
+    )
+    if not lost:
+        same(copy, whole)
+    assert RunDirectory(copy).summary() is not None
+
+
+def test_a_second_process_is_refused(copy):
+    back_to(copy, checkpoint.steps(copy / "checkpoints")[1])
+    before = {p: p.read_bytes() for p in copy.rglob("*") if p.is_file()}
+    hold = f"import pathlib, time; from matd3_jax.runs import lock\nwith lock.held(pathlib.Path({str(copy)!r})):\n"
+    hold += " print('held', flush=True); time.sleep(60)"
+    other = subprocess.Popen([sys.executable, "-c", hold], stdout=subprocess.PIPE, text=True)
+    try:
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(UserError, match=f"is in use: process {other.pid}"):
+            resume(copy)
+    finally:
+        other.kill()
+        other.wait()
+    assert {p: p.read_bytes() for p in copy.rglob("*") if p.is_file() and p.name != lock.NAME} == {
+        p: data for p, data in before.items() if p.name != lock.NAME
+    }
+    resume(copy)
+
+
+def test_checkpoints_come_by_time_but_take_a_twentieth_of_it_at_most(tmp_path, monkeypatch):
+    """A clock that every interval advances by a minute, and every checkpoint by `cost` minutes."""
+    from matd3_jax.training import run as module
+    from matd3_jax.training.session import TrainingSession
+
+    settings = config.load([*SMALL, "checkpoint_every=0", "checkpoint_minutes=3", "log_every=20", "eval_every=0"])
+    saved = {}
+    for cost in (0.0, 0.5):
+        now = [0.0]
+        monkeypatch.setattr(module.time, "monotonic", lambda now=now: now[0])
+        training = TrainingSession(settings)
+        advance = training.advance
+
+        def one_minute(state, now=now, advance=advance):
+            now[0] += 60
+            return advance(state)
+
+        monkeypatch.setattr(training, "advance", one_minute)
+        steps = []
+
+        def save(state, step, now=now, steps=steps, cost=cost):
+            now[0] += 60 * cost
+            steps.append(step)
+
+        state, row = training.start()
+        module.run(training, state, row, save=save, save_first=True)
+        saved[cost] = np.diff(steps) / (training.iterations_per_interval * training.trainer.iteration_steps)
+        assert steps[0] == training.trainer.warmup_steps
+    assert set(saved[0.0]) == {3} and len(saved[0.0]) >= 5
+    assert set(saved[0.5]) == {10}  # twenty times half a minute
+
+
+INNER = PointReach()
+
+
+@dataclasses.dataclass(frozen=True)
+class Empty(Environment):
+    """A task whose state has an array without numbers."""
+
+    agents = INNER.agents
+    observation_sizes = INNER.observation_sizes
+    action_spaces = INNER.action_spaces
+    episode_length = INNER.episode_length
+
+    def reset(self, key):
+        state, seen = INNER.reset(key)
+        return (state, jnp.zeros((0, 2))), seen
+
+    def step(self, key, state, action):
+        after = INNER.step(key, state[0], action)
+        return after._replace(state=(after.state, state[1]))
+
+    def observe(self, state):
+        return INNER.observe(state[0])
+
+
+def test_from_python_with_an_environment_of_ones_own_whose_state_has_an_empty_array(tmp_path):
+    """The directory is the command's; resumed it gives the unbroken run's numbers."""
+    small = dict(text.split("=") for text in SMALL if not text.startswith(("env=", "algo", "total_steps")))
+    options = {**small, "algo": "iddpg", "env": Empty()}
+    broken, whole = tmp_path / "broken", tmp_path / "whole"
+    train = functools.partial(matd3_jax.train, "algo.hidden=[8]", total_steps=1200, **options)
+
+    def interrupt(row):
+        if row["step"][0] > 1000:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(run_dir=broken, callback=interrupt)
+    with pytest.raises(UserError, match="is there already"):
+        train(run_dir=broken)
+    rows = []
+    resumed = matd3_jax.resume(broken, env=Empty(), callback=rows.append)
+    unbroken = train(run_dir=whole)
+    same(broken, whole)
+    assert resumed.run_dir == broken and 0 < len(rows) < resumed.metrics["step"].shape[1]
+    assert resumed.metrics.keys() == unbroken.metrics.keys()
+    for name, column in unbroken.metrics.items():
+        np.testing.assert_array_equal(resumed.metrics[name], column, err_msg=name)
+    longer = matd3_jax.resume(broken, total_steps=1300, env=Empty())
+    assert longer.metrics["step"][0, -1] >= 1300
+    assert longer.evaluate(episodes=2).shape == (2, 2, 2)
+
+
+def test_a_signal_is_noted_while_something_is_printed(monkeypatch):
+    """The handler itself prints nothing: it may run in the middle of a print."""
+    from matd3_jax.runtime import signals
+
+    told = threading.Event()
+    monkeypatch.setattr(signals, "say", lambda line: told.set())
+    before = {name: signal.getsignal(getattr(signal, name)) for name in signals.NAMES}
+    try:
+        stop = signals.Stop()
+        main = threading.current_thread()
+        printed = []
+        monkeypatch.setattr(signals, "say", lambda line: (printed.append(threading.current_thread()), told.set()))
+        signal.raise_signal(signal.SIGHUP)
+        assert stop.signal == signal.SIGHUP
+        assert told.wait(10) and printed[0] is not main
+        with pytest.raises(SystemExit) as ended:
+            signal.raise_signal(signal.SIGTERM)
+        assert ended.value.code == 128 + signal.SIGTERM
+    finally:
+        for name, handler in before.items():
+            signal.signal(getattr(signal, name), handler)
