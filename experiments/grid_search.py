@@ -17,7 +17,7 @@ from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
 from matd3_jax.errors import UserError
-from matd3_jax.stats.intervals import mean_interval
+from matd3_jax.figures.style import SERIES
 
 RATES = (0.01, 0.003, 0.001)
 GRIDS = {
@@ -113,18 +113,13 @@ def draw(table: Table, path: Path) -> None:
     ranks, wanted = ranking(table), best(table)
     figure, (axis,) = figures.canvas(1, width=6.2, height=1.2 + 0.27 * len(ranks))
     for k, (_, final, _) in enumerate(ranks):
-        mean, half = mean_interval(final)
-        color = figures.COLORS["matd3"]
-        if len(final) > 1:
-            axis.errorbar(mean, k, xerr=half, color=color, capsize=3, linewidth=1.2)
-        axis.plot(mean, k, "o", color=color)
-        axis.plot(final, np.full(len(final), k), ".", color="black", markersize=3, alpha=0.45)
+        figures.point(axis, k, final, figures.COLORS["matd3"])
     labels = [", ".join(f"{key} {point[key]:g}" for key in wanted) for point, *_ in ranks]
     axis.set_yticks(range(len(ranks)), labels, fontsize=8)
     for k, (label, (point, *_)) in enumerate(zip(axis.get_yticklabels(), ranks, strict=True)):
         if _is(point, wanted):
             label.set_fontweight("bold")
-            axis.axhspan(k - 0.45, k + 0.45, color=figures.SERIES[1], alpha=0.25, linewidth=0)
+            axis.axhspan(k - 0.45, k + 0.45, color=SERIES[1], alpha=0.25, linewidth=0)
     center = [final.mean() for _, final, _ in ranks]
     axis.set_ylim(len(ranks) - 0.4, -0.6)
     middle, reach = np.nanmedian(center), 1.3 * np.nanmax(np.abs(center - np.nanmedian(center))) + 1e-6

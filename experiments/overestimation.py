@@ -16,6 +16,7 @@ from experiments.study import Study
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
+from matd3_jax.stats.text import number
 
 ALGOS = ("maddpg", "matd3")
 
@@ -146,12 +147,12 @@ def _final(table: Table) -> np.ndarray:
 
 
 def _signs(values: np.ndarray) -> str:
-    mean = verdict.number(float(values.mean()))
+    mean = number(float(values.mean()))
     return f"overestimation {mean}; above zero in {(values > 0).sum()} of {len(values)} seeds"
 
 
 def _thirds(over: np.ndarray) -> str:
-    early, late = (verdict.number(float(values.mean())) for values in (first(over), last(over, 3)))
+    early, late = (number(float(values.mean())) for values in (first(over), last(over, 3)))
     return f"overestimation {early} in the first third, {late} in the last (n = {len(over)})"
 
 
@@ -166,7 +167,7 @@ def draw(table: Table, path: Path) -> None:
             continue
         steps, estimate, truth = found
         figures.band(axis, steps / 1e6, estimate, figures.COLORS[algo], "critics' estimate")
-        figures.band(axis, steps / 1e6, truth, "#555555", "true value", "--")
+        figures.band(axis, steps / 1e6, truth, "#555555", "true value", "dashed")
         axis.legend(frameon=False)
         late = np.concatenate([values.mean(axis=0)[1 + len(steps) // 8 :] for values in (estimate, truth)])
         levels += [1.3 * late.min(initial=0.0), late.max(initial=0.0) + 10]  # the first ones lie far below

@@ -10,15 +10,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from experiments import evaluations, figures, study, verdict
 from experiments.squashing import COMMON
 from experiments.study import Study
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
-from matd3_jax.stats.intervals import mean_interval
+from matd3_jax.figures.style import SERIES
+from matd3_jax.stats.text import seeds
 
 BASE = "base"
 CHANGES: dict[str, list[str]] = {
@@ -106,12 +105,8 @@ def draw(table: Table, path: Path) -> None:
     figure, (axis,) = figures.canvas(1, width=8.0, height=1.3 + 0.4 * len(there))
     for place, (name, values) in enumerate(reversed(list(there.items()))):
         assert values is not None
-        mean, half = mean_interval(values)
-        half = half if len(values) > 1 else 0.0
-        color = figures.SERIES[1 if name == BASE else 0]
-        axis.errorbar(mean, place, xerr=half, fmt="o", color=color, capsize=3)
-        axis.plot(values, np.full(len(values), place) + 0.2, ".", color="black", markersize=3, alpha=0.5)
-    axis.set_yticks(range(len(there)), [f"{name} ({figures.count(len(there[name]))})" for name in reversed(there)])
+        figures.point(axis, place, values, SERIES[1 if name == BASE else 0], offset=0.2)
+    axis.set_yticks(range(len(there)), [f"{name} ({seeds(len(there[name]))})" for name in reversed(there)])
     axis.set_xlabel("evaluations in the last third: mean and its 95 % interval over seeds")
     axis.set_ylim(-0.6, len(there) - 0.4)
     figure.suptitle("Ant, two halves, MATD3, 300,000 env steps: one part changed at a time", fontsize=10)

@@ -13,6 +13,7 @@ from experiments.study import Study
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
+from matd3_jax.figures.style import SERIES
 
 LEVELS = (0, 0.1, 0.2, 0.4)
 MARGIN = 0.05
@@ -51,7 +52,7 @@ def claims(table: Table) -> list[Claim]:
 def draw(table: Table, path: Path) -> None:
     figure, (whole, late) = figures.canvas(2)
     lowest, highest = [], []
-    for sigma, color in zip(LEVELS, figures.SERIES, strict=False):
+    for sigma, color in zip(LEVELS, SERIES, strict=False):
         part = table.where(target_noise=sigma)
         if not len(part):
             continue

@@ -11,6 +11,7 @@ from benchmarks.gpu.report import Report, Row
 from experiments import figures, tidy
 from experiments.tidy import Table
 from matd3_jax import config
+from matd3_jax.figures.style import SERIES
 from matd3_jax.stats import intervals
 from matd3_jax.training.session import TrainingSession
 
@@ -97,7 +98,7 @@ def draw(out: Path) -> None:
     figure, (axis,) = figures.canvas(1, width=6.0, height=4.0)
     curves = {"CPU": recorded()}
     curves |= {f"here, {name}": tidy.read(out / f"simple_spread_{name}.csv") for name in ("default", "float32")}
-    for (label, table), color in zip(curves.items(), figures.SERIES, strict=False):
+    for (label, table), color in zip(curves.items(), SERIES, strict=False):
         if len(table):
             episodes, means = trailing(table)
             figures.band(axis, episodes / 1000, means, color, label)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from matd3_jax.figures.palette import AGENT, Color
+from matd3_jax.figures.style import AGENT, Color
 from matd3_jax.video import opengl
 from matd3_jax.video.scene2d import Drawing
 

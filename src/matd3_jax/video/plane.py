@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from matd3_jax.figures.palette import BLACK, GREEN, PURPLE, WHITE, Color
+from matd3_jax.figures.style import BLACK, GREEN, PURPLE, WHITE, Color
 
 OVERSAMPLING = 3
 """Drawn so many times larger and then shrunk: smooth edges."""

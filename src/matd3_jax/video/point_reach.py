@@ -4,7 +4,7 @@ import numpy as np
 
 from matd3_jax.envs.point_reach import PointReach, PointState
 from matd3_jax.errors import OptionError
-from matd3_jax.figures.palette import BLUE, GREEN, Color
+from matd3_jax.figures.style import BLUE, GREEN, Color
 from matd3_jax.video.plane import Disc, Scene
 
 RADIUS, TARGET_RADIUS = 0.06, 0.05
