@@ -17,9 +17,9 @@ from typing import Any, NamedTuple, Self
 
 import jax
 import numpy as np
-from jax._src.distributed import State  # JAX's coordination service has no public key-value store
 
 from matd3_jax.errors import UserError
+from matd3_jax.private import coordination_service
 from matd3_jax.runtime import devices, slurm
 
 
@@ -218,7 +218,7 @@ def start(given: Mapping[str, str]) -> Processes:
     slurm.look_for(address, index == 0)
     # What `jax.distributed.initialize` does, but for telling JAX's backends, which would join all processes' devices:
     # Orbax would then write arrays in process 0 only, and the compilation cache be written by that one alone.
-    service = State()
+    service = coordination_service()()
     service.initialize(
         *found, cluster_detection_method="deactivate", initialization_timeout=slurm.START_SECONDS,
         shutdown_timeout_seconds=END_SECONDS,
