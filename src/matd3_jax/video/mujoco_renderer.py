@@ -49,6 +49,8 @@ class RobotDrawing(Drawing):
         data = mujoco.MjData(model)
         qpos = _finite(np.asarray(selected, np.float64))
         camera, path = _camera(model, data, qpos), _smooth(_torso_path(model, data, qpos))
+        # Not `mujoco.Renderer`: it draws with the OpenGL that MuJoCo chose when it was imported, GLFW on Linux unless
+        # MUJOCO_GL says otherwise, and closing one while another is current spoils the other's pictures (3.17.0).
         scene, option, perturb = mujoco.MjvScene(model, 10_000), mujoco.MjvOption(), mujoco.MjvPerturb()
         rect = mujoco.MjrRect(0, 0, width, height)
         context = self.new_context(width, height)
