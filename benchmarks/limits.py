@@ -85,10 +85,10 @@ def products(trainer: TrainLoop, part: str = "loop") -> dict[Product, float]:
     "loop"."""
     schedule, layout = trainer.schedule, trainer.layout
     found: dict[Product, float] = {}
-    local = trainer.local_seeds
+    local = trainer.sharding.local_seeds
     updates = trainer.rollouts_per_iteration * schedule.updates_per_collect
     for group in layout.groups:
-        together = trainer.piece * (1 if trainer.on_cpu else len(group.members))
+        together = trainer.sharding.seeds_together * (1 if trainer.on_cpu else len(group.members))
         times = local * len(group.members) / together * updates
         for product, share in _update(trainer, group) if part != "rollout" else ():
             batched = _batched(product, together)
@@ -103,7 +103,7 @@ def products(trainer: TrainLoop, part: str = "loop") -> dict[Product, float]:
 def _update(trainer: TrainLoop, group: Group) -> Iterator[tuple[Product, float]]:
     """(product, how many an update) of one agent of the group: see `core.losses`."""
     layout, algorithm = trainer.layout, group.algorithm
-    batch = trainer.schedule.batch_size // trainer.devices_per_seed
+    batch = trainer.schedule.batch_size // trainer.sharding.devices_per_seed
     hidden, delay = algorithm.hidden, algorithm.policy_delay
     central = algorithm.critic == "central"
     # With one minibatch for all, the members of a group share their target actions.
@@ -167,11 +167,11 @@ def least_bytes(trainer: TrainLoop, part: str = "loop") -> int:
     written, networks and optimizers read and written once an update (twice for what is moved along)."""
     schedule, layout = trainer.schedule, trainer.layout
     batches = 1 if schedule.shared_minibatch else layout.num_agents
-    state = memory.size(trainer.abstract_state().groups) // trainer.rows
+    state = memory.size(trainer.abstract_state().groups) // trainer.sharding.padded_seeds
     written = 4 * layout.row_size * schedule.rollout_steps
     read = schedule.updates_per_collect * (4 * layout.row_size * batches * schedule.batch_size + 2 * state)
     return (
-        trainer.rows
+        trainer.sharding.padded_seeds
         * trainer.rollouts_per_iteration
         * {"rollout": written, "update": read, "loop": written + read}[part]
     )
@@ -229,7 +229,7 @@ def compiled_flops(trainer: TrainLoop) -> float:
     """`counted_flops` of one iteration of all seeds. On accelerators, where products are calls into libraries, those of
     the traced program."""
     state = trainer.abstract_state()
-    shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.layout.row_size)
+    shape = (trainer.sharding.padded_seeds, trainer.schedule.replay_capacity, trainer.layout.row_size)
     state = state._replace(replay=jax.ShapeDtypeStruct(shape, jnp.float32))
     iterations = 2  # a loop that runs once may be unrolled
     traced = trainer.interval(iterations).jitted.trace(state, trainer.hyper)

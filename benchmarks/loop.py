@@ -102,7 +102,7 @@ class Loop:
 def copies_in(text: str, trainer: TrainLoop) -> int:
     """Copies of a device's whole replay in a compiled program (HLO text, as `Compiled.as_text` gives it)."""
     schedule, layout = trainer.schedule, trainer.layout
-    local = f"{trainer.local_seeds},{schedule.replay_capacity},{layout.row_size}"
+    local = f"{trainer.sharding.local_seeds},{schedule.replay_capacity},{layout.row_size}"
     return len(re.findall(rf"f32\[{local}\]\S* copy(-start)?\(", text))
 
 

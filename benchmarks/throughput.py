@@ -31,8 +31,9 @@ from matd3_jax.cli import command
 from matd3_jax.core import replay
 from matd3_jax.errors import UserError
 from matd3_jax.runtime import devices
-from matd3_jax.training.loop import TrainLoop, TrainState
+from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.session import TrainingSession
+from matd3_jax.training.state import TrainState
 
 DEFAULTS: dict[str, Any] = {"seeds": [1, 4, 20], "repeats": 5, "seconds": 1.0, "out": None}
 

@@ -76,7 +76,7 @@ def replay_copies() -> int:
     """Copies of the whole replay in the optimized program of an interval."""
     trainer = TrainingSession(config.load(["seeds=4", "total_steps=100000"])).trainer
     state = trainer.abstract_state()
-    shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.layout.row_size)
+    shape = (trainer.sharding.padded_seeds, trainer.schedule.replay_capacity, trainer.layout.row_size)
     state = state._replace(replay=jax.ShapeDtypeStruct(shape, jnp.float32))
     text = trainer.interval(3).jitted.lower(state, trainer.hyper).compile().as_text()
     return copies_in(text, trainer)

@@ -13,7 +13,7 @@ from jax.profiler import ProfileData, ProfileOptions
 from benchmarks.gpu import seeds, stretch
 from benchmarks.gpu.report import Report, Row
 from benchmarks.gpu.stretch import Compiled, Length
-from matd3_jax.training.loop import TrainState
+from matd3_jax.training.state import TrainState
 
 STREAM = re.compile(r"Stream #")
 """Lines of a device's plane that hold what ran; the others show the same again, by module or by source."""

@@ -52,13 +52,14 @@ def plan(seeds: int, free: int, most: int = REPLAY) -> int:
 def fitting(trainer: TrainLoop, budget: float, most: int) -> int:
     """Rows of each seed's replay that fit into `budget` bytes: what all seeds' states and one update of those that are
     updated together leave. Raises ValueError where not even a minibatch fits."""
-    together = trainer.mesh.size if trainer.on_cpu else trainer.rows
-    beside = trainer.rows * memory.seed_bytes(trainer) + together * memory.update_bytes(trainer)
-    rows = int((budget - beside) // (4 * trainer.rows * trainer.layout.row_size))
+    together = trainer.mesh.size if trainer.on_cpu else trainer.sharding.padded_seeds
+    beside = trainer.sharding.padded_seeds * memory.seed_bytes(trainer) + together * memory.update_bytes(trainer)
+    rows = int((budget - beside) // (4 * trainer.sharding.padded_seeds * trainer.layout.row_size))
     collect = trainer.schedule.rollout_steps
     capacity = min(rows, most) // collect * collect
     if capacity < trainer.schedule.batch_size:
         raise ValueError(
-            f"{trainer.rows} seeds need {beside / 1e9:.1f} GB beside their replays, {budget / 1e9:.1f} GB may be used"
+            f"{trainer.sharding.padded_seeds} seeds need {beside / 1e9:.1f} GB without their replays, "
+            f"{budget / 1e9:.1f} GB may be used"
         )
     return capacity

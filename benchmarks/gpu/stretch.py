@@ -11,8 +11,9 @@ import numpy as np
 from benchmarks import throughput
 from benchmarks.gpu.report import Row
 from matd3_jax import config
-from matd3_jax.training.loop import TrainLoop, TrainState
+from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.session import TrainingSession
+from matd3_jax.training.state import TrainState
 
 
 class Length(NamedTuple):

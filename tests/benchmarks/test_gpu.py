@@ -62,10 +62,10 @@ def test_replay_plan():
     trainer = TrainingSession(config.load(seeds.settings(64, 100_000))).trainer
     beside = seeds.fitting(trainer, 1e15, 10**9)
     assert beside == 10**9, "at most what was asked for"
-    row, budget = 4 * 127 * trainer.rows, 10e9
+    row, budget = 4 * 127 * trainer.sharding.padded_seeds, 10e9
     capacity = seeds.fitting(trainer, budget, 10**9)
-    together = trainer.mesh.size if trainer.on_cpu else trainer.rows
-    free = budget - trainer.rows * memory.seed_bytes(trainer) - together * memory.update_bytes(trainer)
+    together = trainer.mesh.size if trainer.on_cpu else trainer.sharding.padded_seeds
+    free = budget - trainer.sharding.padded_seeds * memory.seed_bytes(trainer) - together * memory.update_bytes(trainer)
     assert capacity % 100 == 0 and capacity * row <= free < (capacity + 100) * row
     with pytest.raises(ValueError, match="64 seeds need .* GB"):
         seeds.fitting(trainer, 1e8, 10**9)

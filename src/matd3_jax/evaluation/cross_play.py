@@ -19,8 +19,8 @@ from matd3_jax.core.rollout import PolicyParams
 from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.envs.environment import Environment
 from matd3_jax.envs.wrappers.joint_team import JointTeam
-from matd3_jax.training.loop import TrainState
 from matd3_jax.training.session import TrainingSession
+from matd3_jax.training.state import TrainState
 
 TEAMS = ("agents", "adversaries")
 """The two sides, in the order of every axis [teams]."""

@@ -10,8 +10,8 @@ import numpy as np
 
 from matd3_jax.core import rollout
 from matd3_jax.core.agents import JointLayout
-from matd3_jax.training.loop import TrainState
 from matd3_jax.training.session import TrainingSession
+from matd3_jax.training.state import TrainState
 
 
 class Episode(NamedTuple):

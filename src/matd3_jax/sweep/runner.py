@@ -27,10 +27,10 @@ from matd3_jax.sweep import batching
 from matd3_jax.training import checkpoint
 from matd3_jax.training import run as training_run
 from matd3_jax.training.loggers import Logger, TableLogger, TensorBoardLogger
-from matd3_jax.training.loop import TrainState
 from matd3_jax.training.memory import fitting_seeds, needed
 from matd3_jax.training.progress import ProgressBar
 from matd3_jax.training.session import Row, TrainingSession
+from matd3_jax.training.state import TrainState
 
 
 class Sweep:

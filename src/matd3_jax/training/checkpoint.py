@@ -22,7 +22,8 @@ import orbax.checkpoint as ocp
 from matd3_jax.core import replay
 from matd3_jax.errors import UserError
 from matd3_jax.runtime.multihost import ALONE, Share
-from matd3_jax.training.loop import TrainLoop, TrainState
+from matd3_jax.training.loop import TrainLoop
+from matd3_jax.training.state import TrainState
 
 RENAMED = ((".rollouts", ".collects"), ("_optimizer", "_optimiser"))
 """Parts of leaves' paths, and what checkpoints from before have in their place."""
@@ -118,9 +119,9 @@ def restore(path: Path, trainer: TrainLoop, share: Share | None = None) -> Train
     share = share or ALONE.share(trainer.num_seeds)
     small = _rebuild(trainer, path, share)
     with ocp.StandardCheckpointer() as checkpointer:
-        filled = trainer.filled_rows(int(small.rollouts))
+        filled = trainer.schedule.filled_rows(int(small.rollouts))
         local = []
-        for device, seeds in trainer.device_seeds():
+        for device, seeds in trainer.sharding.device_seeds():
             shape = (len(seeds), trainer.schedule.replay_capacity, trainer.layout.row_size)
             rows = jax.device_put(jnp.zeros(shape, jnp.float32, device=device), device)
             for place, seed in enumerate(seeds):
@@ -129,7 +130,7 @@ def restore(path: Path, trainer: TrainLoop, share: Share | None = None) -> Train
                     raise UserError(f"{path}: a replay of shape {one.shape} does not fit these settings")
                 rows = _put_rows(rows, jax.device_put(one[None], device), place)
             local.append(rows)
-    shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.layout.row_size)
+    shape = (trainer.sharding.padded_seeds, trainer.schedule.replay_capacity, trainer.layout.row_size)
     rows = jax.make_array_from_single_device_arrays(shape, trainer.shardings.replay, local)
     return small._replace(replay=rows)
 
@@ -165,7 +166,7 @@ def _put_rows(rows: jax.Array, one: jax.Array, place: int) -> jax.Array:
 
 def _replay_rows(trainer: TrainLoop, state: TrainState):
     """(seed number, its filled rows) one after the other."""
-    filled = trainer.filled_rows(int(state.rollouts))
+    filled = trainer.schedule.filled_rows(int(state.rollouts))
     for shard in state.replay.addressable_shards:
         if shard.replica_id:
             continue  # a copy on another device that works on the same seeds
@@ -199,10 +200,11 @@ def _rebuild(trainer: TrainLoop, path: Path, share: Share) -> TrainState:
         wanted = (trainer.num_seeds, *leaf.shape[1:]) if leaf.ndim else ()
         if value.shape != wanted or value.dtype != leaf.dtype:
             raise UserError(f"{path}: {jax.tree_util.keystr(name)} does not fit these settings")
-        leaves.append(value if not leaf.ndim else np.asarray(trainer.fill(value)))
+        leaves.append(value if not leaf.ndim else np.asarray(trainer.sharding.pad(value)))
     state = jax.tree.unflatten(treedef, leaves)
     state = state._replace(
-        key=jax.random.wrap_key_data(jnp.asarray(state.key)), replay=replay.allocate(trainer.rows, 0, 0)
+        key=jax.random.wrap_key_data(jnp.asarray(state.key)),
+        replay=replay.allocate(trainer.sharding.padded_seeds, 0, 0),
     )
     return jax.device_put(state, trainer.shardings)
 

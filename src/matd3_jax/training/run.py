@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.training.loggers import Logger
-from matd3_jax.training.loop import TrainState
 from matd3_jax.training.session import Row, TrainingSession
+from matd3_jax.training.state import TrainState
 
 
 class Outcome(NamedTuple):

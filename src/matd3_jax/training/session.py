@@ -22,8 +22,10 @@ from matd3_jax.runs import overestimation
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import ALONE, Processes
 from matd3_jax.training.clock import Clock
-from matd3_jax.training.loop import Metrics, Program, TrainLoop, TrainState
+from matd3_jax.training.evaluator import Evaluator
+from matd3_jax.training.loop import Program, TrainLoop
 from matd3_jax.training.schedule import Schedule
+from matd3_jax.training.state import Metrics, TrainState
 
 Row = dict[str, np.ndarray]
 """Columns of the metrics table for one interval: each [seeds]; "step" and "seed" among them."""
@@ -91,12 +93,12 @@ class TrainingSession:
         trainer = TrainLoop(self.env, self.layout, schedule, hyper, seeds, local, **options)
         # Whole intervals of equal length, so that one compiled program does for all; as many as come closest to
         # log_every.
-        iterations = max(1, math.ceil((config.total_steps - trainer.warmup_steps) / trainer.iteration_steps))
+        iterations = max(1, math.ceil((config.total_steps - trainer.schedule.warmup_steps) / trainer.iteration_steps))
         wanted = max(1, round((config.log_every or config.total_steps / 100) / trainer.iteration_steps))
         self.num_intervals = math.ceil(iterations / wanted)
         self.iterations_per_interval = math.ceil(iterations / self.num_intervals)
         self.total_steps = (
-            trainer.warmup_steps + self.num_intervals * self.iterations_per_interval * trainer.iteration_steps
+            trainer.schedule.warmup_steps + self.num_intervals * self.iterations_per_interval * trainer.iteration_steps
         )
         """Env steps of each seed: the first whole interval at or after the wanted number."""
         # Rows that would never be written are not allocated: the same result in less memory.
@@ -104,6 +106,7 @@ class TrainingSession:
         schedule = dataclasses.replace(schedule, replay_capacity=capacity)
         kept = config.diagnostics.q_bias_rollouts if config.diagnostics.q_bias else 0
         self.trainer = TrainLoop(self.env, self.layout, schedule, hyper, seeds, local, q_bias_pairs=kept, **options)
+        self.evaluator = Evaluator(self.trainer)
 
     def _hyper(self, team: str) -> HyperParams:
         """The team's hyper-parameters, leaves [seeds]."""
@@ -116,12 +119,13 @@ class TrainingSession:
     def memory(self) -> str:
         """The arithmetic of the replay's memory."""
         t, s = self.trainer, self.layout
-        copies = f"{t.devices_per_seed} copies x " if t.devices_per_seed > 1 else ""
+        copies = f"{t.sharding.devices_per_seed} copies x " if t.sharding.devices_per_seed > 1 else ""
         whose = f" of process {self.processes.index}" if self.processes.size > 1 else ""
         return (
-            f"replay{whose}: {t.rows} seeds x {copies}{t.schedule.replay_capacity:,} transitions x {s.row_size} "
-            f"numbers x 4 bytes = {t.replay_bytes / 1e9:.2f} GB (x {s.observation_size}, actions {s.action_size}, "
-            f"rewards {s.num_agents}, {'more 1, ' if s.n_step > 1 else ''}x' {s.observation_size}, discount 1)"
+            f"replay{whose}: {t.sharding.padded_seeds} seeds x {copies}{t.schedule.replay_capacity:,} transitions x "
+            f"{s.row_size} numbers x 4 bytes = {t.replay_bytes / 1e9:.2f} GB "
+            f"(x {s.observation_size}, actions {s.action_size}, rewards "
+            f"{s.num_agents}, {'more 1, ' if s.n_step > 1 else ''}x' {s.observation_size}, discount 1)"
         )
 
     def check_memory(self) -> None:
@@ -231,7 +235,7 @@ class TrainingSession:
         # Apart from the training's keys, which are split from key(seed).
         key = jax.random.fold_in(jax.random.key(seed), 2**31 - 1)
         keys = jax.vmap(lambda _: key)(self.seeds)
-        found = self.trainer.evaluate(state, keys, episodes, deterministic)
+        found = self.evaluator.evaluate(state, keys, episodes, deterministic)
         return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), found)
 
     def _evaluated(self, state: TrainState, due: bool) -> tuple[TrainState, Row]:
@@ -269,6 +273,6 @@ class TrainingSession:
             return state, {}
         found = None
         if due and int(state.rollouts) > int(state.reservoir.since):
-            found = self.trainer.measure_q_bias(state, self.config.diagnostics.q_bias_steps)
-            state = self.trainer.restart_reservoir(state)
+            found = self.evaluator.measure_q_bias(state, self.config.diagnostics.q_bias_steps)
+            state = self.evaluator.restart_reservoir(state)
         return state, overestimation.columns(self.layout.agents, found, len(self.seeds))
