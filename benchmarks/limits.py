@@ -5,7 +5,7 @@
 Other keys are settings of the run, as `python -m matd3_jax.train` takes them. Measured in the same run, on the same
 devices: the rate of every matrix product of the loop, by itself and at its own shape (batched over seeds, agents and
 twins as the loop has them; on one device alone, and on all at once), and the memory's bandwidth. From these and the
-products of one iteration, counted by hand and again in the compiled program, follows the floor: the time that the
+products of one iteration, counted by hand and again in the compiled program, follows the roofline: the time that the
 products alone take, or the bytes that must be moved at least, whichever is more. Nothing else is in it: no bias, no
 ReLU, no random numbers, no sampling, no optimizer, no environment.
 """
@@ -55,7 +55,7 @@ class Product:
 
 
 @dataclasses.dataclass(frozen=True)
-class Floor:
+class Roofline:
     """The least time of one iteration of all seeds together, seconds."""
 
     alone: float
@@ -299,8 +299,8 @@ def _median(call: Callable[[], Any], repeats: int) -> float:
     return float(np.median(times))
 
 
-def floor(trainer: TrainLoop, repeats: int = 5, part: str = "loop") -> tuple[Floor, list[dict[str, Any]]]:
-    """The floor of one iteration, or of a part of it (see `products`), and a row for every kind of product."""
+def roofline(trainer: TrainLoop, repeats: int = 5, part: str = "loop") -> tuple[Roofline, list[dict[str, Any]]]:
+    """The roofline of one iteration, or of a part of it (see `products`), and a row for every kind of product."""
     devices_used = trainer.mesh.size
     rows = []
     for product, count in products(trainer, part).items():
@@ -312,7 +312,7 @@ def floor(trainer: TrainLoop, repeats: int = 5, part: str = "loop") -> tuple[Flo
         })  # fmt: skip
     flops = devices_used * sum(row["count"] * row["flops"] for row in rows)
     alone, together = (sum(row["count"] * row[f"seconds_{how}"] for row in rows) for how in ("alone", "together"))
-    return Floor(alone, together, least_bytes(trainer, part) / bandwidth(repeats), flops), rows
+    return Roofline(alone, together, least_bytes(trainer, part) / bandwidth(repeats), flops), rows
 
 
 def main(argv: Sequence[str]) -> int:
@@ -323,12 +323,12 @@ def main(argv: Sequence[str]) -> int:
     trainer = TrainingSession(settings).trainer
     report: dict[str, Any] = {"machine": devices.description(), "versions": devices.versions()}
     report |= {"commit": commit(), "settings": list(argv)}
-    found, rows = floor(trainer, options["repeats"])
+    found, rows = roofline(trainer, options["repeats"])
     for row in sorted(rows, key=lambda row: -row["count"] * row["seconds_alone"]):
         shapes = f"{row['equation']:<14} {list(row['left'])} {list(row['right'])}"
         print(f"{shapes:<56} {row['flops'] / row['seconds_alone'] / 1e9:8.1f} GFLOP/s alone "
               f"{row['flops'] / row['seconds_together'] / 1e9:8.1f} each of {trainer.mesh.size} at once   "
-              f"{row['count'] * row['seconds_alone'] / found.alone:6.1%} of the floor")  # fmt: skip
+              f"{row['count'] * row['seconds_alone'] / found.alone:6.1%} of the roofline")  # fmt: skip
     steps = trainer.num_seeds * trainer.iteration_steps
     counted = compiled_flops(trainer)
     report |= {"floor": dataclasses.asdict(found), "products": rows, "flops_in_compiled_program": counted}

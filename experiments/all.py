@@ -4,9 +4,9 @@
                               [key=value ...]
 
 Takes the options of the single experiments and gives them to each. Whatever is finished is used as it is, so a call
-that was stopped goes on with the same command. `runs` and `out` are folders of folders here, one for each experiment;
+that was stopped resumes with the same command. `runs` and `out` are folders of folders here, one for each experiment;
 the summary is summary.md (summary_small.md) in `out`. `skip` leaves experiments out. An experiment that cannot be run
-(no memory, a setting that it does not take) is told of in the summary, and the next one follows.
+(no memory, a setting that it does not take) is reported in the summary, and the next one follows.
 """
 
 from collections.abc import Sequence
@@ -62,7 +62,7 @@ def main(argv: Sequence[str]) -> int:
         if name in skip:
             continue
         options, _ = study.parse(one, rest)
-        runs_folder, out_folder = study.places(one, options)
+        runs_folder, out_folder = study.folders(one, options)
         more = [f"out={out / out_folder.name}"]
         more += [f"runs={Path(str(taken['runs'])) / runs_folder.name}"] if "runs" in taken else []
         print(f"\n==== {name}", flush=True)
@@ -76,7 +76,7 @@ def main(argv: Sequence[str]) -> int:
             lines += [*verdict.lines(one.claims(Table({}))), "", f"Could not be run: {error}"]
             failed = 2
         except Stopped as stopped:
-            print("stopped; go on with the same command")
+            print("stopped; resume with the same command")
             return stopped.code
         lines.append("")
     small = options["scale"] == "small"

@@ -1,4 +1,4 @@
-"""`python -m experiments.ant`: MATD3 beside MADDPG, IL-TD3 and single-agent TD3 on a robot shared out among agents.
+"""`python -m experiments.ant`: MATD3, MADDPG, IL-TD3 and single-agent TD3 on a robot shared out among agents.
 
     python -m experiments.ant [env=ant] [recipe=fast] [algos=[matd3,maddpg,iltd3,td3]] [seeds=6] [train=true]
                               [runs=runs/ENV] [out=experiments/results/ENV] [key=value ...]
@@ -40,7 +40,7 @@ def check(options: Mapping[str, Any]) -> None:
         raise UserError(f"recipe={options['recipe']}: must be one of {', '.join(config.known_names('recipe'))}")
 
 
-def place(options: Mapping[str, Any]) -> tuple[Path, Path]:
+def folders(options: Mapping[str, Any]) -> tuple[Path, Path]:
     name = options["env"] or ("ant" if options["scale"] == "paper" else "half_cheetah")
     if options["scale"] == "small" and name != "half_cheetah":
         name = f"{name}_small"
@@ -116,7 +116,7 @@ STUDY = Study(
     evaluations=True,
     options={"env": None, "recipe": "fast", "algos": ["matd3", "maddpg", "iltd3", "td3"]},
     check=check,
-    place=place,
+    folders=folders,
     data="curves.csv",
     figure="curves.png",
 )

@@ -2,9 +2,9 @@
 
     python -m experiments.cooperative_navigation [seeds=10] [total_steps=250000] [out=experiments/results/simple_spread]
 
-Trains MATD3 and MADDPG on simple_spread with the paper's settings (10,000 episodes of 25 steps) and lays the training
-returns over those of the authors' own program (experiments/reference). Writes the table of both (curves.csv), a figure
-(curves.png), a comparison (table.md) and the machine and versions (machine.json) into `out`.
+Trains MATD3 and MADDPG on simple_spread with the paper's settings (10,000 episodes of 25 steps) and compares the
+training returns with those of the authors' own program (experiments/reference). Writes the table of both (curves.csv),
+a figure (curves.png), a comparison (table.md) and the machine and versions (machine.json) into `out`.
 """
 
 import csv

@@ -62,13 +62,13 @@ def band(axis: Axes, x: np.ndarray, curves: np.ndarray, color: str, label: str, 
     style.band(axis, x, t_interval(curves), color, f"{label} ({seeds(len(curves))})", dashes)
 
 
-def bar(axis: Axes, place: float, values: np.ndarray, color: str, width: float = 0.8) -> None:
+def bar(axis: Axes, position: float, values: np.ndarray, color: str, width: float = 0.8) -> None:
     """Mean of values [seeds] with its 95 % interval, and each of them as a dot."""
     mean, half = mean_interval(values)
-    axis.bar(place, mean, width, color=color, alpha=0.75, zorder=2)
+    axis.bar(position, mean, width, color=color, alpha=0.75, zorder=2)
     if len(values) > 1:
-        axis.errorbar(place, mean, half, color="black", capsize=3, linewidth=1.2, zorder=4)
-    across = place + np.linspace(-0.25, 0.25, len(values)) * width if len(values) > 1 else [place]
+        axis.errorbar(position, mean, half, color="black", capsize=3, linewidth=1.2, zorder=4)
+    across = position + np.linspace(-0.25, 0.25, len(values)) * width if len(values) > 1 else [position]
     axis.plot(across, values, ".", color="black", markersize=3, alpha=0.45, zorder=3)
 
 

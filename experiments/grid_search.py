@@ -56,7 +56,7 @@ def check(options: Mapping[str, Any]) -> None:
         raise UserError("task=ant scale=small: the Ant is not trained in minutes; use task=particle, or scale=paper")
 
 
-def place(options: Mapping[str, Any]) -> tuple[Path, Path]:
+def folders(options: Mapping[str, Any]) -> tuple[Path, Path]:
     name = "grid_search" + ("_ant" if options["task"] == "ant" else "")
     name += "" if options["scale"] == "paper" else "_small"
     return Path("runs/experiments") / name, RESULTS / name
@@ -96,13 +96,13 @@ def claims(table: Table) -> list[Claim]:
     name = ", ".join(f"{key} {value:g}" for key, value in wanted.items())
     paper = f"{name} was found to work best"
     ranks = ranking(table)
-    place = next((k for k, (point, *_) in enumerate(ranks) if _is(point, wanted)), None)
-    if place is None or len(ranks) < 2:
-        return [Claim(paper, "final return: this setting less the best other one")]
-    other = ranks[1 if place == 0 else 0]
-    told = ", ".join(f"{key} {other[0][key]:g}" for key in wanted)
-    more = f"; it ranks {place + 1} of {len(ranks)} (to have picked the best of the others favors them)"
-    return [verdict.compare(paper, "final return", (name, ranks[place][1]), (told, other[1]), more=more)]
+    rank = next((k for k, (point, *_) in enumerate(ranks) if _is(point, wanted)), None)
+    if rank is None or len(ranks) < 2:
+        return [Claim(paper, "final return: this setting minus the best other one")]
+    other = ranks[1 if rank == 0 else 0]
+    best_other = ", ".join(f"{key} {other[0][key]:g}" for key in wanted)
+    more = f"; it ranks {rank + 1} of {len(ranks)} (to have picked the best of the others favors them)"
+    return [verdict.compare(paper, "final return", (name, ranks[rank][1]), (best_other, other[1]), more=more)]
 
 
 def _is(point: Mapping[str, float], wanted: Mapping[str, float]) -> bool:
@@ -157,7 +157,7 @@ STUDY = Study(
     points=60,
     options={"task": "particle"},
     check=check,
-    place=place,
+    folders=folders,
 )
 
 

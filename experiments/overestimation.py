@@ -1,7 +1,7 @@
 """`python -m experiments.overestimation`: how far the critics of MADDPG and MATD3 overestimate on Cooperative
 Navigation.
 
-Figure 1 of the paper: the critics' estimates beside the true discounted returns, both from states and actions stored
+Figure 1 of the paper: the critics' estimates and the true discounted returns, both from states and actions stored
 since the last evaluation, along training with episodes of 200 steps.
 """
 
@@ -73,7 +73,10 @@ def claims(table: Table) -> list[Claim]:
     found = {algo: measured(part) for algo, part in parts.items()}
     over = {algo: None if f is None else f[1] - f[2] for algo, f in found.items()}
     truth = {algo: None if f is None else last(f[2]) for algo, f in found.items()}
-    mean_over, less_late = "MADDPG: estimate less true value, mean over training", "MADDPG: first third less last third"
+    mean_over, first_minus_last = (
+        "MADDPG: estimate minus true value, mean over training",
+        "MADDPG: first third minus last third",
+    )
     texts = {
         "over": "MADDPG overestimates",
         "early": "MADDPG overestimates especially in earlier episodes",
@@ -87,14 +90,14 @@ def claims(table: Table) -> list[Claim]:
         Claim(texts["over"], mean_over)
         if bias is None
         else Claim(texts["over"], mean_over, verdict.mean(bias.mean(axis=1)), found=_signs(bias.mean(axis=1))),
-        Claim(texts["early"], less_late)
+        Claim(texts["early"], first_minus_last)
         if bias is None
-        else Claim(texts["early"], less_late, verdict.mean(first(bias) - last(bias, 3)), found=_thirds(bias)),
-        Claim(texts["under"], "MATD3: true value less estimate, mean over training")
+        else Claim(texts["early"], first_minus_last, verdict.mean(first(bias) - last(bias, 3)), found=_thirds(bias)),
+        Claim(texts["under"], "MATD3: true value minus estimate, mean over training")
         if theirs is None
         else Claim(
             texts["under"],
-            "MATD3: true value less estimate, mean over training",
+            "MATD3: true value minus estimate, mean over training",
             verdict.mean(-theirs.mean(axis=1)),
             found=_signs(theirs.mean(axis=1)),
         ),
@@ -121,7 +124,7 @@ def _beyond_claims(rest: Mapping[str, np.ndarray | None]) -> list[Claim]:
     found = []
     for algo, sign, text in (("maddpg", 1, "MADDPG overestimates"), ("matd3", -1, "MATD3 underestimates")):
         text += ", beyond the targets' lag"
-        quantity = f"{figures.NAMES[algo]}: {'-' * (sign < 0)}(estimate less true value less lag), last two thirds"
+        quantity = f"{figures.NAMES[algo]}: {'-' * (sign < 0)}(estimate minus true value minus lag), last two thirds"
         values = rest[algo]
         if values is None:
             found.append(Claim(text, quantity))
@@ -184,7 +187,7 @@ def draw(table: Table, path: Path) -> None:
         if levels:
             axis.set_ylim(min(levels), max(levels))
     axes[2].axhline(0, color="black", linewidth=0.8)
-    axes[2].set_ylabel("overestimation (estimate less true value)")
+    axes[2].set_ylabel("overestimation (estimate minus true value)")
     late = [line.get_ydata()[1 + len(line.get_ydata()) // 8 :] for line in axes[2].lines[:-1]]
     if late:  # the first evaluations, far above the others, would leave nothing to see of those
         late = np.concatenate(late)

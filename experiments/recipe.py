@@ -103,9 +103,9 @@ def claims(table: Table) -> list[Claim]:
 def draw(table: Table, path: Path) -> None:
     there = {name: evaluations.late(part) for name, part in parts(table).items()}
     figure, (axis,) = figures.canvas(1, width=8.0, height=1.3 + 0.4 * len(there))
-    for place, (name, values) in enumerate(reversed(list(there.items()))):
+    for position, (name, values) in enumerate(reversed(list(there.items()))):
         assert values is not None
-        figures.point(axis, place, values, SERIES[1 if name == BASE else 0], offset=0.2)
+        figures.point(axis, position, values, SERIES[1 if name == BASE else 0], offset=0.2)
     axis.set_yticks(range(len(there)), [f"{name} ({seeds(len(there[name]))})" for name in reversed(there)])
     axis.set_xlabel("evaluations in the last third: mean and its 95 % interval over seeds")
     axis.set_ylim(-0.6, len(there) - 0.4)

@@ -2,7 +2,7 @@
 
     python -m experiments.robots [only=PATTERN] [seeds=3] [train=true] [key=value ...]
 
-One recipe for all of them; the Ant in two halves is in `experiments.ant`. Beside the returns stand those of HARL's
+One recipe for all of them; the Ant in two halves is in `experiments.ant`. The table also has the returns of HARL's
 MATD3 (Zhong et al. 2024), read off its figures.
 """
 

@@ -17,7 +17,7 @@ from matd3_jax.figures.style import SERIES
 
 LEVELS = (0, 0.1, 0.2, 0.4)
 MARGIN = 0.05
-"""Of what is learned without smoothing (final less untrained return): a smaller gain counts as none."""
+"""Of what is learned without smoothing (final minus untrained return): a smaller gain counts as none."""
 
 SCALES = {
     "paper": ["seeds=10", "total_steps=1500000", "log_every=12500"],

@@ -1,4 +1,4 @@
-"""What the paper found beside what we found: differences with intervals and tests, and a word for each claim.
+"""What the paper found compared with what we found: differences with intervals and tests, and a word for each claim.
 
 The word is decided by the 95 % confidence interval of one difference, which the paper's claim says is positive, or nil:
 
@@ -11,7 +11,7 @@ The word is decided by the 95 % confidence interval of one difference, which the
 
 Means are compared by Welch's t test, single means and differences within a seed by Student's, correlations by Fisher's
 transformation. p-values are two-sided. Where a table has several, Holm's correction for all of its claims of the kind
-"greater" stands beside them; the words go by the uncorrected intervals.
+"greater" is given, too; the words go by the uncorrected intervals.
 """
 
 import dataclasses
@@ -150,7 +150,7 @@ def compare(
 ) -> Claim:
     """The claim that the mean of `first` is greater than that of `second` (or another `kind`): (name, values
     [seeds])."""
-    quantity = f"{quantity}: {first[0]} less {second[0]}"
+    quantity = f"{quantity}: {first[0]} minus {second[0]}"
     (one, a), (other, b) = first, second
     if a is None or b is None:
         return Claim(paper, quantity, kind=kind, margin=margin)

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from benchmarks.gpu.report import Report, Row
-from benchmarks.gpu.stretch import Length
+from benchmarks.gpu.timing import Length
 from experiments import evaluations, figures, tidy
 from experiments.tidy import Table
 from matd3_jax import config

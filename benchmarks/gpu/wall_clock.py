@@ -21,7 +21,7 @@ RECORDED = Path(__file__).parents[2] / "experiments" / "results" / "cooperative"
 SEEDS, STEPS, LOG_EVERY = 20, 1_500_000, 12_500
 RETURN = "return_agents"
 POINTS = (5_000, 10_000, 20_000, 40_000, 60_000)
-"""Episodes at which returns are laid beside the CPU's."""
+"""Episodes at which returns are compared with the CPU's."""
 
 
 def run(report: Report, scale: float) -> None:
@@ -63,7 +63,7 @@ def measure(name: str, precision: str | None, scale: float, out: Path) -> Row:
         "warm_up_seconds": warm_up,
         "compile_seconds": max(0.0, first - warm_up - interval),
         "env_steps_per_second": seeds * training.total_steps / seconds,
-        "returns": beside(table, recorded()),
+        "returns": compared(table, recorded()),
     }
 
 
@@ -71,9 +71,9 @@ def recorded() -> Table:
     return tidy.read(RECORDED).where(env="simple_spread", algo="matd3")
 
 
-def beside(ours: Table, theirs: Table) -> list[Row]:
-    """Mean returns of the last 1,000 episodes at `POINTS` (of a shorter run at its end), ours less theirs with the 95 %
-    interval of the difference and its p-value, of which chance alone brings one in twenty below 0.05."""
+def compared(ours: Table, theirs: Table) -> list[Row]:
+    """Mean returns of the last 1,000 episodes at `POINTS` (of a shorter run at its end), ours minus theirs with the
+    95 % interval of the difference and its p-value, of which chance alone brings one in twenty below 0.05."""
     (episodes, values), (their_episodes, their_values) = trailing(ours), trailing(theirs)
     end = min(episodes[-1], their_episodes[-1])
     found = []

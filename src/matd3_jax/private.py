@@ -16,7 +16,7 @@ class Moved(RuntimeError):
 def coordination_service() -> Any:
     """Look up JAX's coordination service: the class of its state, which has `initialize`, `shutdown` and `client`.
 
-    JAX has no public key-value store between processes; `jax.distributed` tells its backends of the processes besides.
+    JAX has no public key-value store between processes; `jax.distributed` also makes its backends join the processes.
     """
     client = _find("jaxlib", "jaxlib._jax", "DistributedRuntimeClient")
     for name in (
@@ -37,7 +37,7 @@ def mjx_collisions() -> MutableMapping[tuple, Callable]:
 
 
 def mjx_collider(contacts: int) -> Callable[[Callable], Callable]:
-    """Decorate a collision function of two geometries with so many `contacts` as MJX calls it."""
+    """Decorate a collision function of two geometries that has `contacts` contacts, as MJX calls it."""
     return _find("mujoco-mjx", "mujoco.mjx._src.collision_primitive", "collider")(ncon=contacts)
 
 

@@ -124,8 +124,8 @@ def test_returns_beside_the_recorded_ones():
     """Half of the recorded seeds learn as the others do; 30 more return, which is what a defect would cost, shows."""
     table = wall_clock.recorded()
     odd, even = (table.take(table["seed"] % 2 == k) for k in (1, 0))
-    rows = wall_clock.beside(odd, even)
+    rows = wall_clock.compared(odd, even)
     assert [row["episodes"] for row in rows] == [5_000, 10_000, 20_000, 40_000, 60_000]
     assert all(row["p"] > 0.01 for row in rows)
     better = Table({**odd.columns, wall_clock.RETURN: odd[wall_clock.RETURN] + 30})
-    assert sum(row["p"] < 0.01 for row in wall_clock.beside(better, even)) >= 3
+    assert sum(row["p"] < 0.01 for row in wall_clock.compared(better, even)) >= 3

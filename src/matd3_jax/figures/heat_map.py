@@ -19,8 +19,8 @@ def draw(path: Path, names: Sequence[str], pairings: Pairings, title: str) -> No
     """Write the picture: rows are the runs of the agents, columns those of the adversaries.
 
     In each cell stands the mean return with its interval; a run against itself is framed, and the pairs trained
-    together stand there apart. A cell's color is the mean over the others, where there are others. The colors are
-    told apart by color-blind eyes, and in grey.
+    together stand there apart. A cell's color is the mean over the others, where there are others. The colors can
+    be distinguished with any color vision, and in grey.
     """
     n = len(names)
     longest = max(len(name) for name in names)

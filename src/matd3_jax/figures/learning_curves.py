@@ -50,9 +50,9 @@ def check(path: Path) -> Path:
 def compare(
     path: Path, panels: Sequence[Panel], x_label: str, title: str = "", caption: str = "", each: bool = False
 ) -> None:
-    """Draw lines with bands, side by side in panels, in colors and dashes that can be told apart.
+    """Draw lines with bands, side by side in panels, in colors and dashes that can be distinguished.
 
-    The legend stands beside the panels where there are many lines or panels, or else in a free corner.
+    The legend is to the right of the panels where there are many lines or panels, or else in a free corner.
 
     Args:
         caption: over the legend.
@@ -85,7 +85,7 @@ def compare(
         else:
             legend = axes[0].legend(loc="best", **frame)
         legend.get_title().set_fontsize(style.PRINTED["legend.fontsize"])
-        if legend.axes is None:  # beside the panels: they keep their size
+        if legend.axes is None:  # to the right of the panels: they keep their size
             extent = legend.get_window_extent(figure.canvas.get_renderer())
             figure.set_size_inches(width + extent.width / figure.dpi, max(height, extent.height / figure.dpi + 0.2))
         try:

@@ -1,4 +1,4 @@
-"""The critics' estimates beside true values, and how far they overestimate."""
+"""The critics' estimates and true values, and how far they overestimate."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

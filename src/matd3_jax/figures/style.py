@@ -1,4 +1,4 @@
-"""How figures look: colors told apart with any color vision (Okabe and Ito 2008), dashes, and curves with bands."""
+"""How figures look: colors to distinguish with any color vision (Okabe and Ito 2008), dashes, and curves with bands."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -43,7 +43,7 @@ SERIES: tuple[str, ...] = tuple(map(web, (BLUE, ORANGE, GREEN, PURPLE, VERMILION
 """Of curves in one figure, for matplotlib; without the yellow, which is faint on white."""
 
 STYLES = ("solid", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5)), (0, (8, 2)))
-"""As many as stand apart; 5 and the 7 colors have no common factor, so 35 lines differ in one or the other."""
+"""As many as can be distinguished; 5 and the 7 colors have no common factor, so 35 lines differ in one or the other."""
 
 PRINTED: dict[Any, Any] = {
     "font.size": 9,

@@ -73,17 +73,17 @@ def _values(axis, key: str, rows: Sequence[Ranked], metric: str) -> None:
         numbers = None
     listed = sorted(set(texts), key=float) if numbers is not None else sorted(set(texts))
     if len(listed) > 8 and numbers is not None:  # drawn from an interval
-        places = numbers
+        at = numbers
         if (numbers > 0).all() and numbers.max() > 10 * numbers.min():
             axis.set_xscale("log")
     else:
-        places = np.array([listed.index(text) for text in texts], float)
+        at = np.array([listed.index(text) for text in texts], float)
         axis.set_xticks(range(len(listed)), listed, rotation=30 if max(map(len, listed)) > 8 else 0)
         for k in range(len(listed)):
-            axis.hlines(np.median(finals[places == k]), k - 0.25, k + 0.25, color="black", linewidth=1.2)
+            axis.hlines(np.median(finals[at == k]), k - 0.25, k + 0.25, color="black", linewidth=1.2)
         axis.margins(x=0.15)
-    axis.scatter(places, finals, s=14, color="0.5", alpha=0.7, linewidth=0)
-    axis.scatter(places[:1], finals[:1], s=28, color=BEST[0], zorder=3)  # the best setting
+    axis.scatter(at, finals, s=14, color="0.5", alpha=0.7, linewidth=0)
+    axis.scatter(at[:1], finals[:1], s=28, color=BEST[0], zorder=3)  # the best setting
     axis.set_xlabel(key)
     axis.set_ylabel(f"final {metric}", fontsize=8)
     style.dress(axis)

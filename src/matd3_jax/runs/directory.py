@@ -36,7 +36,7 @@ class RunDirectory:
         try:
             path.mkdir(parents=True)
         except FileExistsError:
-            raise UserError(f"{path} is there already: choose another name=, or go on with resume={path}") from None
+            raise UserError(f"{path} is there already: choose another name=, or resume it with resume={path}") from None
         except OSError as error:
             raise UserError(f"cannot make the run directory {path}: {error.strerror}") from error
         run = cls(path)

@@ -38,7 +38,7 @@ def columns(agents: Sequence[str], found: Values | None, seeds: int) -> dict[str
 
 
 def tail_note(hyper: Sequence[HyperParams], steps: int) -> str | None:
-    """One line where rollouts of `steps` end too early to stand beside the critics' infinite horizon; else None."""
+    """One line where rollouts of `steps` end too early to be compared with the critics' infinite horizon; else None."""
     gamma = max(float(np.max(h.gamma)) for h in hyper)
     if gamma**steps <= TOLERATED_TAIL:
         return None

@@ -1,4 +1,4 @@
-"""What a run came to: the last tenth of it, over its seeds."""
+"""The summary of a run: the last tenth of it, over its seeds."""
 
 from typing import Any
 

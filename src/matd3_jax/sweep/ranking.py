@@ -1,4 +1,4 @@
-"""The settings of a sweep in the order of what they came to."""
+"""The settings of a sweep, ranked by their final returns."""
 
 import csv
 import dataclasses
@@ -17,7 +17,7 @@ from matd3_jax.stats.text import plus_minus
 
 @dataclasses.dataclass(frozen=True)
 class Ranked:
-    """What one setting came to; arrays [seeds]."""
+    """The summary of one setting; arrays [seeds]."""
 
     name: str
     values: Mapping[str, str]

@@ -21,14 +21,14 @@ import orbax.checkpoint as ocp
 
 from matd3_jax.core import replay
 from matd3_jax.errors import UserError
-from matd3_jax.runtime.multihost import ALONE, Share
+from matd3_jax.runtime.multihost import SINGLE_PROCESS, Share
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.state import TrainState
 
 RENAMED = ((".rollouts", ".collects"), ("_optimizer", "_optimiser"))
-"""Parts of leaves' paths, and what checkpoints from before have in their place."""
+"""Parts of leaves' paths, and what older checkpoints have instead."""
 
-logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax tells of every step at INFO and warns of its own defaults.
+logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax logs every step at INFO and warns of its own defaults.
 
 
 def save(
@@ -43,11 +43,11 @@ def save(
     """Write the checkpoint of env step `step` and delete all but the newest `keep`.
 
     Args:
-        seeds: write these seeds' part alone, without their replay: enough to evaluate them, not to go on. None: all.
+        seeds: write these seeds' part alone, without their replay: enough to evaluate them, not to resume. None: all.
         share: which seeds the trainer has. Every process writes its own, the first makes a checkpoint of it. None:
             there are no others.
     """
-    share = share or ALONE.share(trainer.num_seeds)
+    share = share or SINGLE_PROCESS.share(trainer.num_seeds)
     processes, wanted = share.processes, seeds or slice(0, share.total)
     folder = folder.resolve()
     final, partial_ = folder / str(step), folder / f".{step}.partial"
@@ -68,7 +68,7 @@ def save(
             written.append(partial_ / "replay" / str(share.first + seed))
             checkpointer.save(written[-1], {"rows": rows})
             checkpointer.wait_until_finished()
-    parts = processes.collect(json.dumps(_checksums(partial_, written)).encode())
+    parts = processes.gather_messages(json.dumps(_checksums(partial_, written)).encode())
     if processes.first:
         checksums = dict(sorted(pair for part in parts for pair in json.loads(part).items()))
         (partial_ / "checksums.json").write_text(json.dumps(checksums, indent=1))
@@ -103,7 +103,7 @@ def verify(folder: Path, step: int | None = None) -> Path:
         damaged = "checksums.json"
     if damaged is not None:
         before = [other for other in found if other < step]
-        hint = f"go on from the one before it with checkpoint={before[-1]}" if before else "there is none before it"
+        hint = f"resume from the one before it with checkpoint={before[-1]}" if before else "there is none before it"
         raise UserError(f"the checkpoint {folder / str(step)} is damaged ({damaged}); {hint}")
     return path
 
@@ -115,8 +115,8 @@ def restore(path: Path, trainer: TrainLoop, share: Share | None = None) -> Train
     share: which of the checkpoint's seeds the trainer has; None: all.
     """
     if not (path / "replay").is_dir():
-        raise UserError(f"{path} holds no replay: what a sweep leaves of a run can be evaluated, not gone on with")
-    share = share or ALONE.share(trainer.num_seeds)
+        raise UserError(f"{path} holds no replay: what a sweep leaves of a run can be evaluated, not resumed")
+    share = share or SINGLE_PROCESS.share(trainer.num_seeds)
     small = _rebuild(trainer, path, share)
     with ocp.StandardCheckpointer() as checkpointer:
         filled = trainer.schedule.filled_rows(int(small.rollouts))
@@ -124,11 +124,11 @@ def restore(path: Path, trainer: TrainLoop, share: Share | None = None) -> Train
         for device, seeds in trainer.sharding.device_seeds():
             shape = (len(seeds), trainer.schedule.replay_capacity, trainer.layout.row_size)
             rows = jax.device_put(jnp.zeros(shape, jnp.float32, device=device), device)
-            for place, seed in enumerate(seeds):
+            for index, seed in enumerate(seeds):
                 one = np.asarray(checkpointer.restore(path / "replay" / str(share.first + seed))["rows"])
                 if one.shape[0] > shape[1] or one.shape[0] < filled or one.shape[1] != shape[2]:
                     raise UserError(f"{path}: a replay of shape {one.shape} does not fit these settings")
-                rows = _put_rows(rows, jax.device_put(one[None], device), place)
+                rows = _put_rows(rows, jax.device_put(one[None], device), index)
             local.append(rows)
     shape = (trainer.sharding.padded_seeds, trainer.schedule.replay_capacity, trainer.layout.row_size)
     rows = jax.make_array_from_single_device_arrays(shape, trainer.shardings.replay, local)
@@ -136,8 +136,8 @@ def restore(path: Path, trainer: TrainLoop, share: Share | None = None) -> Train
 
 
 def restore_actors(path: Path, trainer: TrainLoop) -> TrainState:
-    """The state without its replay (an empty one in its place): enough to evaluate."""
-    return _rebuild(trainer, path, ALONE.share(trainer.num_seeds))
+    """The state without its replay (an empty one instead): enough to evaluate."""
+    return _rebuild(trainer, path, SINGLE_PROCESS.share(trainer.num_seeds))
 
 
 def read_state(path: Path, first: int, last: int, total: int) -> dict[str, np.ndarray]:
@@ -160,8 +160,8 @@ def read_state(path: Path, first: int, last: int, total: int) -> dict[str, np.nd
 
 
 @partial(jax.jit, donate_argnums=0, static_argnums=2)
-def _put_rows(rows: jax.Array, one: jax.Array, place: int) -> jax.Array:
-    return jax.lax.dynamic_update_slice(rows, one, (place, 0, 0))
+def _put_rows(rows: jax.Array, one: jax.Array, index: int) -> jax.Array:
+    return jax.lax.dynamic_update_slice(rows, one, (index, 0, 0))
 
 
 def _replay_rows(trainer: TrainLoop, state: TrainState):
@@ -171,9 +171,9 @@ def _replay_rows(trainer: TrainLoop, state: TrainState):
         if shard.replica_id:
             continue  # a copy on another device that works on the same seeds
         first = shard.index[0].start or 0
-        for place in range(shard.data.shape[0]):
-            if first + place < trainer.num_seeds:
-                yield first + place, np.asarray(shard.data[place, :filled])
+        for index in range(shard.data.shape[0]):
+            if first + index < trainer.num_seeds:
+                yield first + index, np.asarray(shard.data[index, :filled])
 
 
 def _leaves(trainer: TrainLoop, state: TrainState, seeds: slice) -> dict[str, np.ndarray]:

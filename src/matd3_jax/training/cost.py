@@ -177,9 +177,9 @@ def expectation(training: TrainingSession, done: int = 0) -> str:
     layer = max(pairwise(critic), key=lambda sizes: sizes[0] * sizes[1])
     # Larger products are done at the same rate, and take longer to measure.
     shape = (min(size, 1024) for size in (schedule.batch_size // trainer.sharding.devices_per_seed, *layer))
-    places = tuple(trainer.mesh.devices.flat)
-    products = product_rate(places, *shape)
-    physics = physics_rate(training.env, places, trainer.sharding.local_seeds * schedule.num_envs)
+    used = tuple(trainer.mesh.devices.flat)
+    products = product_rate(used, *shape)
+    physics = physics_rate(training.env, used, trainer.sharding.local_seeds * schedule.num_envs)
     steps = training.total_steps - done
     learning = training.total_steps - max(done, trainer.schedule.warmup_steps)
     evaluations = training.evaluations_after(max(done, trainer.schedule.warmup_steps))

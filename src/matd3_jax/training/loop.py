@@ -236,7 +236,7 @@ class TrainLoop:
         else:
             together = self.sharding.seeds_together
             states, metrics = jax.lax.map(one, (seeds, state.groups, keys[:, 0], hyper), batch_size=together)
-        # The next rollout writes where these updates read. Where the actor is delayed nothing else tells XLA to do one
+        # The next rollout writes where these updates read. Where the actor is delayed nothing else makes XLA do one
         # after the other, and it would copy the whole replay: so let the count of rollouts, hence the next write's
         # offset, depend on the updates. A mean squared error is never negative; XLA does not know.
         wait = jnp.any(metrics.critic_loss < 0).astype(jnp.int32)

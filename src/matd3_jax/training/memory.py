@@ -23,17 +23,17 @@ def needed(trainer: TrainLoop, seeds: int) -> int:
     """
     devices = len(jax.local_devices())
     each = idle_devices(devices, seeds, trainer.schedule.batch_size) if trainer.on_cpu else 1
-    places = min(seeds, devices // each)
-    rows = math.ceil(seeds / places) * places
+    shares = min(seeds, devices // each)
+    rows = math.ceil(seeds / shares) * shares
     copies = each * rows  # a seed's state is on all the devices that work on it
     replay = trainer.replay_bytes // (trainer.sharding.padded_seeds * trainer.sharding.devices_per_seed)
-    together = places if trainer.on_cpu else rows  # seeds updated at the same time
+    together = shares if trainer.on_cpu else rows  # seeds updated at the same time
     # A checkpoint is written seed by seed: one seed's replay on its way out, and once more in the writer's hands.
     return PROCESS + copies * (replay + seed_bytes(trainer)) + together * update_bytes(trainer) + 2 * replay
 
 
 def seed_bytes(trainer: TrainLoop) -> int:
-    """Bytes of one seed beside its replay: its state, twice while it changes, and a rollout with its fresh starts."""
+    """Bytes of one seed without its replay: its state, twice while it changes, and a rollout with its fresh starts."""
     schedule, layout = trainer.schedule, trainer.layout
     state = trainer.abstract_state()
     whole = size(state._replace(replay=None, rollouts=None)) // trainer.sharding.padded_seeds  # type: ignore[arg-type]
@@ -43,7 +43,7 @@ def seed_bytes(trainer: TrainLoop) -> int:
 
 
 def update_bytes(trainer: TrainLoop) -> int:
-    """Bytes that one seed's update takes beside its state: minibatches, noise, activations and their gradients."""
+    """Bytes that one seed's update takes besides its state: minibatches, noise, activations and their gradients."""
     layout, schedule = trainer.layout, trainer.schedule
     agents = 1 if trainer.on_cpu else layout.num_agents  # agents updated at the same time
     widest = max(

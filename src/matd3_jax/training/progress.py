@@ -47,7 +47,7 @@ class ProgressBar:
             self.bar.start()
 
     def log(self, row: Row) -> None:
-        """Tell of one more interval."""
+        """Show one more interval."""
         self.now, self.compiled = time.monotonic(), compiling()
         self._note(row)
         text = self.text()

@@ -17,7 +17,7 @@ class Outcome(NamedTuple):
     row: Row
     """Of the last logging interval."""
     stopped: Signals | None
-    """The signal that ended it; None where it came to its end."""
+    """The signal that ended it; None where it was trained to its end."""
 
 
 def run(

@@ -20,7 +20,7 @@ from matd3_jax.envs.wrappers.joint_team import JointTeam
 from matd3_jax.errors import UserError
 from matd3_jax.runs import overestimation
 from matd3_jax.runtime import devices
-from matd3_jax.runtime.multihost import ALONE, Processes
+from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.training.clock import Clock
 from matd3_jax.training.evaluator import Evaluator
 from matd3_jax.training.loop import Program, TrainLoop
@@ -37,7 +37,7 @@ take some 3 % of a robot's training with the fast recipe, less with others."""
 
 
 class TrainingSession:
-    """Programs and plan of one run, or of several that share a program (a piece of a sweep).
+    """Programs and plan of one run, or of several that share a program (a batch of a sweep).
 
     Args:
         config: checked settings.
@@ -55,7 +55,7 @@ class TrainingSession:
         config: Config,
         env: Environment | None = None,
         members: Sequence[Config] | None = None,
-        processes: Processes = ALONE,
+        processes: Processes = SINGLE_PROCESS,
     ):
         self.config, self.processes = config, processes
         self.members = (config,) if members is None else tuple(members)
@@ -130,7 +130,7 @@ class TrainingSession:
 
     def check_memory(self) -> None:
         """Raise UserError, with the arithmetic, if the replay cannot fit."""
-        free = devices.free_memory(self.processes.here)
+        free = devices.free_memory(self.processes.local)
         if self.trainer.replay_bytes > free:
             raise UserError(
                 f"{self.memory}, but only {free / 1e9:.2f} GB are free: fewer seeds, or replay_capacity at most "
@@ -140,7 +140,7 @@ class TrainingSession:
     # ---- running -----------------------------------------------------------------------------------------------------
 
     def keys(self) -> jax.Array:
-        """One key a seed; a seed's key does not depend on the seeds beside it."""
+        """One key a seed; a seed's key does not depend on the other seeds."""
         return jax.vmap(jax.random.key)(self.seeds)
 
     def start(self) -> tuple[TrainState, Row]:
@@ -267,7 +267,7 @@ class TrainingSession:
 
     def q_bias(self, state: TrainState, due: bool) -> tuple[TrainState, Row]:
         """The state with its reservoir restarted, and what an evaluation says of the critics (see
-        `overestimation.columns`); the same state and nan where none is due, or nothing was collected since the last.
+        `overestimation.columns`); the same state and nan where none is due, or there was no rollout since the last.
         No columns with diagnostics.q_bias off."""
         if state.reservoir is None:
             return state, {}

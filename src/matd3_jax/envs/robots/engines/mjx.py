@@ -40,7 +40,7 @@ class MjxEngine:
         data = self.data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=qacc_warmstart, ctrl=control)
         rk4 = self.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
         step = runge_kutta.step if rk4 else mjx.step
-        # TF32 products, which GPUs take for float32 unless told otherwise, wreck the physics.
+        # TF32 products, which GPUs take for float32 by default, wreck the physics.
         with as_in_c(), jax.default_matmul_precision("highest"):
             data = jax.lax.scan(lambda d, _: (step(self.model, d), None), data, length=frame_skip)[0]
             if "cfrc_ext" in fields:  # MJX leaves it at 0 otherwise
