@@ -14,8 +14,7 @@ def test_every_seed_has_a_device_and_copies_fill_the_mesh():
     assert sharding.device_seeds() == [(one, [0, 1]), (two, [2, 2])]
     padded = np.asarray(sharding.pad(np.arange(6.0).reshape(3, 2)))
     np.testing.assert_array_equal(padded, [[0, 1], [2, 3], [4, 5], [4, 5]])
-    with sharding.mesh:
-        doubled = sharding.sharded(lambda x: 2 * x, jax.P("seeds"), jax.P("seeds"))(padded)
+    doubled = jax.jit(sharding.sharded(lambda x: 2 * x, jax.P("seeds"), jax.P("seeds")))(padded)
     np.testing.assert_array_equal(doubled, 2 * padded)
     assert len(doubled.sharding.device_set) == 2
 
