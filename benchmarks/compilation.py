@@ -63,7 +63,7 @@ def main(argv: Sequence[str]) -> int:
     programs["start"] = {**found, **_passed(begun)}
 
     def evaluate(state, keys):
-        return trainer.evaluate(state, keys, settings.eval_episodes, True)
+        return training.evaluator.evaluate(state, keys, settings.eval_episodes, True)
 
     for name, jitted, arguments in (
         ("warm-up", trainer.warm_up.jitted, (state, trainer.hyper)),

@@ -1,10 +1,10 @@
 """`python -m benchmarks.compile_times`: how long train's programs take to compile for each environment, cold and warm.
 
 Default: every environment that has settings. For each a fresh process with an empty compilation cache and another one
-with the cache that the first has filled (`benchmarks.compilation`); medians of `repeats` such pairs. `at_once`: so many
-environments side by side, each on its share of the cores alone. Other keys are settings of the run. Told are, for each
-program, wall-clock seconds (of which tracing and lowering, done in Python) and processor time, which other work on the
-machine changes less; cold programs of more than 30 s of a core are marked.
+with the cache that the first has filled (`benchmarks.compilation`); medians of `repeats` such pairs. `at_once`: this
+many environments side by side, each on its share of the cores alone. Other keys are settings of the run. It reports,
+for each program, wall-clock seconds (of which tracing and lowering, done in Python) and processor time, which other
+work on the machine changes less; cold programs of more than 30 s of a core are marked.
 """
 
 import dataclasses
@@ -120,7 +120,7 @@ def slow(environments: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def cores(at_once: int) -> list[set[int] | None]:
-    """The cores that each of so many processes side by side has to itself; None: all, or where one cannot choose."""
+    """The cores that each of several processes has to itself; None: all, or where one cannot choose."""
     if at_once == 1 or not hasattr(os, "sched_getaffinity"):
         return [None] * at_once
     there = sorted(os.sched_getaffinity(0))

@@ -14,7 +14,7 @@ def run(module: str, arguments: Sequence[str], environment: Mapping[str, str] | 
     """What `python -m module *arguments` prints as its last line, read as JSON.
 
     Args:
-        environment: variables to set beside those of this process.
+        environment: variables to set in addition to those of this process.
 
     Raises UserError with the process's own error line where it ends with exit code 2 (a setting that cannot be), or
     where it was killed, as a machine without memory left does; RuntimeError with the end of what it wrote otherwise.

@@ -3,9 +3,9 @@
 simple_spread, each axis alone (an empty list leaves it out); the others stay at the paper's settings with `few_seeds`
 seeds and a replay of 25,600 transitions, where learning starts in the paper. Replays are full. Other keys are settings
 of the run. Each point is a process of its own (`benchmarks.loop`): time of an iteration of all seeds (200 env steps of
-each and, for MATD3, two updates), median of `repeats` stretches of `seconds`; memory as XLA counts it for the compiled
+each and, for MATD3, two updates), median of `repeats` blocks of `seconds`; memory as XLA counts it for the compiled
 interval, and at most of the whole process. The exponent k of time ~ value^k is the slope of a least-squares line
-through the logarithms: over all points, and over the upper half of them. A figure is drawn beside `out`.
+through the logarithms: over all points, and over the upper half of them. A figure is drawn next to `out`.
 """
 
 import dataclasses
@@ -65,7 +65,7 @@ def main(argv: Sequence[str]) -> int:
         "settings": list(argv),
         "beside": {"seeds": options.few_seeds, **BASE},
     }
-    print(f"commit {report['commit']}; beside each axis {report['beside']}")
+    print(f"commit {report['commit']}; settings of the other axes {report['beside']}")
     print(f"{'axis':<7} {'value':>9} {'ms/iter':>11} {'env steps/s':>12} {'GFLOP':>8} {'XLA, MB':>9} "
           f"{'of it replay':>12} {'temporaries':>11} {'process':>8} {'compiled in':>11}", flush=True)  # fmt: skip
     axes: dict[str, list[dict[str, Any]]] = {}

@@ -11,12 +11,18 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, NullLocator
 
-from matd3_jax.figures.learning_curves import COLORS, PAPER
+from matd3_jax.figures import style
+from matd3_jax.figures.style import BLUE, GREEN, ORANGE, VERMILION, Color, web
+from matd3_jax.stats.intervals import Estimate
 
 LABELS = {"seeds": "seeds", "agents": "agents", "replay": "transitions in each replay", "batch": "minibatch"}
 ORDERS = {"agents": (2, 3)}
 """Powers drawn for the eye; elsewhere the first."""
-MEMORY = {"process": (1, "process at most"), "xla": (0, "the interval's, by XLA"), "replay": (4, "of it the replay")}
+MEMORY = {
+    "process": (VERMILION, "process at most"),
+    "xla": (BLUE, "the interval's, by XLA"),
+    "replay": (ORANGE, "of it the replay"),
+}
 NAMES = {1: "linear", 2: "quadratic", 3: "cubic"}
 
 
@@ -29,18 +35,18 @@ def draw(path: Path, axes: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
     columns = {name: there for name, points in axes.items() if (there := [p for p in points if "error" not in p])}
     if not columns:
         return
-    with matplotlib.rc_context(PAPER):
+    with matplotlib.rc_context(style.PRINTED):
         figure = Figure(figsize=(2.6 * len(columns) + 0.6, 5.2), layout="constrained")
         FigureCanvasAgg(figure)
         grid = figure.subplots(2, len(columns), squeeze=False, sharex="col", sharey="row")
         for (top, bottom), (name, points) in zip(grid.T, columns.items(), strict=True):
             x = np.array([point["value"] for point in points], float)
             times = 1000 * np.array([[p["cycle_seconds"], p["fastest"], p["slowest"]] for p in points])
-            top.fill_between(x, times[:, 1], times[:, 2], color=COLORS[0], alpha=0.2, linewidth=0)
+            style.band(top, x, Estimate(*times.T), web(BLUE), width=1.4)
             flops = np.array([point["product_flops_of_a_cycle"] for point in points])
             expected = times[0, 0] * flops / flops[0]
-            top.plot(x, expected, color=COLORS[2], linestyle=(0, (1, 1)), label="as the products")
-            _line(top, x, times[:, 0], 0, "measured")
+            top.plot(x, expected, color=web(GREEN), linestyle=(0, (1, 1)), label="as the products")
+            _line(top, x, times[:, 0], BLUE, "measured")
             for key, (color, label) in MEMORY.items():
                 _line(bottom, x, np.array([point["memory"][key] / 1e6 for point in points]), color, label)
             memory = np.array([point["memory"]["xla"] / 1e6 for point in points])
@@ -56,12 +62,11 @@ def draw(path: Path, axes: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
         figure.savefig(path, dpi=200)
 
 
-def _line(axis: Axes, x: np.ndarray, y: np.ndarray, color: int, label: str) -> None:
-    axis.loglog(x, y, color=COLORS[color], linewidth=1.4, marker="o", markersize=3, label=label)
+def _line(axis: Axes, x: np.ndarray, y: np.ndarray, color: Color, label: str) -> None:
+    axis.loglog(x, y, color=web(color), linewidth=1.4, marker="o", markersize=3, label=label)
     axis.xaxis.set_minor_locator(NullLocator())
     axis.set_xticks(x, [f"{v:.0f}" if v < 10_000 else EngFormatter(sep="")(v) for v in x], rotation=45)
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.grid(alpha=0.25)
+    style.dress(axis)
 
 
 def _guides(axis: Axes, x: np.ndarray, first: float, orders: Sequence[int]) -> None:

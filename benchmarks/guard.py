@@ -84,8 +84,8 @@ def main(argv: Sequence[str]) -> int:
         print(f"written to {RECORDED}")
     recorded = found[platform]["ratios"]
     for key, bound in BOUNDS.items():
-        told = " ({:.3g} to {:.3g} in turns)".format(*spread[key]) if key in spread else ""
-        print(f"{bound.meaning}: {ratios[key]:.3g}{told}; recorded {recorded[key]:.3g}, "
+        turns = " ({:.3g} to {:.3g} in turns)".format(*spread[key]) if key in spread else ""
+        print(f"{bound.meaning}: {ratios[key]:.3g}{turns}; recorded {recorded[key]:.3g}, "
               f"at most {bound.limit(recorded[key]):.3g}")  # fmt: skip
     print(f"took {time.monotonic() - begun:.0f} s", flush=True)
     broken = failures(ratios, recorded)
@@ -110,7 +110,7 @@ def measure() -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
     calls = loop.calls(0.4)
     rates, loops, rollouts = [throughput.matmul_gflops(2)], [], []
     for _ in range(ROUNDS):
-        loops.append(loop.cycle_seconds(calls))
+        loops.append(loop.iteration_seconds(calls))
         begun = time.perf_counter()
         loop.state, _ = jax.block_until_ready(trainer.warm_up(loop.state))
         each = (time.perf_counter() - begun) / trainer.schedule.warmup_rollouts
@@ -118,7 +118,7 @@ def measure() -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
         rates.append(throughput.matmul_gflops(2))
     around = (np.array(rates[1:]) + np.array(rates[:-1])) / 2
     in_turns = {
-        "loop_over_floor": np.array(loops) / floor_seconds(loop, around),
+        "loop_over_floor": np.array(loops) / roofline_seconds(loop, around),
         "rollout_share": np.array(rollouts) / np.array(loops),
     }
     memory = loop.memory()
@@ -129,10 +129,10 @@ def measure() -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
     return rounded, {k: (round(float(v.min()), 4), round(float(v.max()), 4)) for k, v in in_turns.items()}
 
 
-def floor_seconds(loop: Loop, gflops: Any) -> Any:
+def roofline_seconds(loop: Loop, gflops: Any) -> Any:
     """The least time that an iteration's matrix products take where all devices together do `gflops` (an array,
     too)."""
-    return loop.cycle_flops / 1e9 / gflops
+    return loop.iteration_flops / 1e9 / gflops
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 Other keys are settings of the run, as `python -m matd3_jax.train` takes them. Measured in the same run, on the same
 devices: the rate of every matrix product of the loop, by itself and at its own shape (batched over seeds, agents and
 twins as the loop has them; on one device alone, and on all at once), and the memory's bandwidth. From these and the
-products of one iteration, counted by hand and again in the compiled program, follows the floor: the time that the
+products of one iteration, counted by hand and again in the compiled program, follows the roofline: the time that the
 products alone take, or the bytes that must be moved at least, whichever is more. Nothing else is in it: no bias, no
 ReLU, no random numbers, no sampling, no optimizer, no environment.
 """
@@ -62,7 +62,7 @@ class Product:
 
 
 @dataclasses.dataclass(frozen=True)
-class Floor:
+class Roofline:
     """The least time of one iteration of all seeds together, seconds."""
 
     alone: float
@@ -92,10 +92,10 @@ def products(trainer: TrainLoop, part: str = "loop") -> dict[Product, float]:
     "loop"."""
     schedule, layout = trainer.schedule, trainer.layout
     found: dict[Product, float] = {}
-    local = trainer.local_seeds
+    local = trainer.sharding.local_seeds
     updates = trainer.rollouts_per_iteration * schedule.updates_per_collect
     for group in layout.groups:
-        together = trainer.piece * (1 if trainer.on_cpu else len(group.members))
+        together = trainer.sharding.seeds_together * (1 if trainer.on_cpu else len(group.members))
         times = local * len(group.members) / together * updates
         for product, share in _update(trainer, group) if part != "rollout" else ():
             batched = _batched(product, together)
@@ -110,7 +110,7 @@ def products(trainer: TrainLoop, part: str = "loop") -> dict[Product, float]:
 def _update(trainer: TrainLoop, group: Group) -> Iterator[tuple[Product, float]]:
     """(product, how many an update) of one agent of the group: see `core.losses`."""
     layout, algorithm = trainer.layout, group.algorithm
-    batch = trainer.schedule.batch_size // trainer.devices_per_seed
+    batch = trainer.schedule.batch_size // trainer.sharding.devices_per_seed
     hidden, delay = algorithm.hidden, algorithm.policy_delay
     central = algorithm.critic == "central"
     # With one minibatch for all, the members of a group share their target actions.
@@ -174,11 +174,11 @@ def least_bytes(trainer: TrainLoop, part: str = "loop") -> int:
     written, networks and optimizers read and written once an update (twice for what is moved along)."""
     schedule, layout = trainer.schedule, trainer.layout
     batches = 1 if schedule.shared_minibatch else layout.num_agents
-    state = memory.size(trainer.abstract_state().groups) // trainer.rows
+    state = memory.size(trainer.abstract_state().groups) // trainer.sharding.padded_seeds
     written = 4 * layout.row_size * schedule.rollout_steps
     read = schedule.updates_per_collect * (4 * layout.row_size * batches * schedule.batch_size + 2 * state)
     return (
-        trainer.rows
+        trainer.sharding.padded_seeds
         * trainer.rollouts_per_iteration
         * {"rollout": written, "update": read, "loop": written + read}[part]
     )
@@ -236,7 +236,7 @@ def compiled_flops(trainer: TrainLoop) -> float:
     """`counted_flops` of one iteration of all seeds. On accelerators, where products are calls into libraries, those of
     the traced program."""
     state = trainer.abstract_state()
-    shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.layout.row_size)
+    shape = (trainer.sharding.padded_seeds, trainer.schedule.replay_capacity, trainer.layout.row_size)
     state = state._replace(replay=jax.ShapeDtypeStruct(shape, jnp.float32))
     iterations = 2  # a loop that runs once may be unrolled
     traced = trainer.interval(iterations).jitted.trace(state, trainer.hyper)
@@ -306,8 +306,8 @@ def _median(call: Callable[[], Any], repeats: int) -> float:
     return float(np.median(times))
 
 
-def floor(trainer: TrainLoop, repeats: int = 5, part: str = "loop") -> tuple[Floor, list[dict[str, Any]]]:
-    """The floor of one iteration, or of a part of it (see `products`), and a row for every kind of product."""
+def roofline(trainer: TrainLoop, repeats: int = 5, part: str = "loop") -> tuple[Roofline, list[dict[str, Any]]]:
+    """The roofline of one iteration, or of a part of it (see `products`), and a row for every kind of product."""
     devices_used = trainer.mesh.size
     rows = []
     for product, count in products(trainer, part).items():
@@ -319,7 +319,7 @@ def floor(trainer: TrainLoop, repeats: int = 5, part: str = "loop") -> tuple[Flo
         })  # fmt: skip
     flops = devices_used * sum(row["count"] * row["flops"] for row in rows)
     alone, together = (sum(row["count"] * row[f"seconds_{how}"] for row in rows) for how in ("alone", "together"))
-    return Floor(alone, together, least_bytes(trainer, part) / bandwidth(repeats), flops), rows
+    return Roofline(alone, together, least_bytes(trainer, part) / bandwidth(repeats), flops), rows
 
 
 def main(argv: Sequence[str]) -> int:
@@ -329,12 +329,12 @@ def main(argv: Sequence[str]) -> int:
     trainer = TrainingSession(settings).trainer
     report: dict[str, Any] = {"machine": devices.description(), "versions": devices.versions()}
     report |= {"commit": commit(), "settings": list(argv)}
-    found, rows = floor(trainer, options.repeats)
+    found, rows = roofline(trainer, options.repeats)
     for row in sorted(rows, key=lambda row: -row["count"] * row["seconds_alone"]):
         shapes = f"{row['equation']:<14} {list(row['left'])} {list(row['right'])}"
         print(f"{shapes:<56} {row['flops'] / row['seconds_alone'] / 1e9:8.1f} GFLOP/s alone "
               f"{row['flops'] / row['seconds_together'] / 1e9:8.1f} each of {trainer.mesh.size} at once   "
-              f"{row['count'] * row['seconds_alone'] / found.alone:6.1%} of the floor")  # fmt: skip
+              f"{row['count'] * row['seconds_alone'] / found.alone:6.1%} of the roofline")  # fmt: skip
     steps = trainer.num_seeds * trainer.iteration_steps
     counted = compiled_flops(trainer)
     report |= {"floor": dataclasses.asdict(found), "products": rows, "flops_in_compiled_program": counted}

@@ -27,7 +27,7 @@ from matd3_jax.runtime import devices
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.session import TrainingSession
 
-CYCLES = 2
+ITERATIONS = 2
 """Of one call of the compiled interval: how many does not change the program but for a number."""
 
 
@@ -48,7 +48,7 @@ def main(argv: Sequence[str]) -> int:
     devices.prepare()
     loop = Loop(config.load(options.overrides))
     calls = loop.calls(options.seconds)
-    times = [loop.cycle_seconds(calls) for _ in range(options.repeats)]
+    times = [loop.iteration_seconds(calls) for _ in range(options.repeats)]
     trainer = loop.trainer
     steps = trainer.num_seeds * trainer.iteration_steps
     report = {
@@ -58,7 +58,7 @@ def main(argv: Sequence[str]) -> int:
         "env_steps_per_second": steps / float(np.median(times)),
         "env_steps_of_a_cycle": steps,
         "updates_of_a_cycle": trainer.rollouts_per_iteration * trainer.schedule.updates_per_collect,
-        "product_flops_of_a_cycle": loop.cycle_flops,
+        "product_flops_of_a_cycle": loop.iteration_flops,
         "compile_seconds": round(loop.compile_seconds, 1),
         "devices": trainer.mesh.size,
         "row_numbers": trainer.layout.row_size,
@@ -78,26 +78,26 @@ class Loop:
         self.trainer = training.trainer
         self.state, _ = jax.block_until_ready(self.trainer.warm_up(self.trainer.init(training.keys())))
         begun = time.perf_counter()
-        interval = self.trainer.interval(CYCLES)
+        interval = self.trainer.interval(ITERATIONS)
         traced = interval.jitted.trace(self.state, interval.hyper)
         self.compiled = traced.lower().compile()
         self.compile_seconds = time.perf_counter() - begun
-        self.cycle_flops = product_flops(traced.jaxpr.jaxpr) / CYCLES
+        self.iteration_flops = product_flops(traced.jaxpr.jaxpr) / ITERATIONS
         """Floating point operations of the matrix products of an iteration of all seeds."""
 
-    def cycle_seconds(self, calls: int) -> float:
+    def iteration_seconds(self, calls: int) -> float:
         """Seconds of an iteration of all seeds, mean over `calls` of the interval."""
         begun = time.perf_counter()
         for _ in range(calls):
             self.state, _ = self.compiled(self.state, self.trainer.hyper)
         jax.block_until_ready(self.state)
-        return (time.perf_counter() - begun) / (calls * CYCLES)
+        return (time.perf_counter() - begun) / (calls * ITERATIONS)
 
     def calls(self, seconds: float) -> int:
         """How many calls of the interval take about `seconds`, at least one; tried, so the interval is warm after
         it."""
-        self.cycle_seconds(1)
-        return max(1, round(seconds / (CYCLES * self.cycle_seconds(1))))
+        self.iteration_seconds(1)
+        return max(1, round(seconds / (ITERATIONS * self.iteration_seconds(1))))
 
     def memory(self) -> dict[str, int]:
         """Bytes, over all devices: XLA's count for the compiled interval (`arguments` hold the replay; what it gives
@@ -116,7 +116,7 @@ class Loop:
 def copies_in(text: str, trainer: TrainLoop) -> int:
     """Copies of a device's whole replay in a compiled program (HLO text, as `Compiled.as_text` gives it)."""
     schedule, layout = trainer.schedule, trainer.layout
-    local = f"{trainer.local_seeds},{schedule.replay_capacity},{layout.row_size}"
+    local = f"{trainer.sharding.local_seeds},{schedule.replay_capacity},{layout.row_size}"
     return len(re.findall(rf"f32\[{local}\]\S* copy(-start)?\(", text))
 
 

@@ -1,6 +1,6 @@
-"""`python -m benchmarks.peers`: env steps/s of this trainer beside other programs that do the same work, in one run.
+"""`python -m benchmarks.peers`: env steps/s of this trainer and of other programs that do the same work, in one run.
 
-Peers that fit beside this package are installed with its extra `peers`; the others get virtual environments under
+Peers that can be installed with this package are so by its extra `peers`; the others get virtual environments under
 `envs` (default: peers in the cache folder). The rows are fixed (`benchmarks/peers_scripts/rows.py`); `only` leaves out
 whole peers. Everything runs on the CPU, and never two sides at once: in each turn every way to do the work is measured
 for `seconds` (compilation left out), ours and the peer's one after the other, the order reversed from turn to turn. A
@@ -166,7 +166,7 @@ def _ask(pool: Sequence[Process], **request: Any) -> list[dict[str, Any]]:
 
 
 def key(variant: Variant) -> str:
-    """What tells variants apart; rows may share them."""
+    """What distinguishes variants; rows may share them."""
     return json.dumps([variant.worker, variant.case, variant.processes], sort_keys=True)
 
 

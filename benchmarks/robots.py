@@ -48,7 +48,7 @@ def main(argv: Sequence[str]) -> int:
     for key in ("machine", "versions", "commit", "gflops"):
         print(f"{key}: {report[key]}")
     print(f"{'environments':>12} {'part':<12} {'env steps/s':>12} {'slowest':>10} {'fastest':>10} "
-          f"{'of floor':>8}", flush=True)  # fmt: skip
+          f"{'roofline':>8}", flush=True)  # fmt: skip
     for n in options.num_envs:
         parts = None if options.loops else ("environment",)
         settings = [f"env={options.env}", *schedule(n), *options.overrides]

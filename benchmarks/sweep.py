@@ -1,6 +1,6 @@
-"""`python -m benchmarks.sweep`: what a sweep costs beside as many seeds of one setting.
+"""`python -m benchmarks.sweep`: what a sweep costs compared with as many seeds of one setting.
 
-Takes settings as `python -m matd3_jax.sweep` does (default: the 18 of its documentation) and times, in turns, a stretch
+Takes settings as `python -m matd3_jax.sweep` does (default: the 18 of its documentation) and times, in turns, a block
 of `steps` env steps of every seed of each program that the sweep consists of, and of one program with as many seeds of
 the setting without the swept values. The cost is the time of all the sweep's programs over that of the one; compilation
 is told apart. Where a swept value changes what is computed (policy_delay=1 updates actors twice as often as the
@@ -40,7 +40,7 @@ COMMAND = Command("python -m benchmarks.sweep", Options, __doc__)
 
 SWEPT = ("algo.lr=0.01,0.003,0.001", "algo.tau=0.01,0.005", "algo.policy_delay=1,2,3")
 SHORT = ("learning_starts=2000", "replay_capacity=10000", "total_steps=10000")
-"""A small replay, so that the sweep fits into one piece for each program; rows are drawn at random all the same."""
+"""A small replay, so that the sweep fits into one batch for each program; rows are drawn at random all the same."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -56,7 +56,7 @@ def main(argv: Sequence[str]) -> int:
     base = config.load(SearchSpace.parse(overrides).fixed)
     alone = [config.load([*SearchSpace.parse(overrides).fixed, f"seeds={len(settings) * base.seeds}"])]
     programs = [_Program(members, options.steps) for members in [alone, *groups.values()]]
-    seconds = np.array([[program.stretch() for program in programs] for _ in range(options.repeats)])
+    seconds = np.array([[program.block() for program in programs] for _ in range(options.repeats)])
     cost = seconds[:, 1:].sum(axis=1) / seconds[:, 0]
     rates = len(settings) * base.seeds * programs[0].steps / seconds[:, 0]
     compiled = [program.compile_seconds for program in programs]
@@ -92,7 +92,7 @@ class _Program:
         self.state, _ = jax.block_until_ready(self.interval(self.state))
         self.compile_seconds = round(time.monotonic() - begun, 1)
 
-    def stretch(self) -> float:
+    def block(self) -> float:
         """Seconds for `steps` env steps of every seed."""
         begun = time.monotonic()
         self.state, _ = jax.block_until_ready(self.interval(self.state))

@@ -3,11 +3,11 @@
 To compare machines, the rate of a matrix product of the loop's kind on all devices at once is measured first and last.
 
 Other keys are settings of the run, as `python -m matd3_jax.train` takes them. Every figure counts all seeds together
-and is the median of `repeats` stretches of about a second, with the slowest and the fastest beside it. Parts:
+and is the median of `repeats` blocks of about a second, with the slowest and the fastest. Parts:
 "environment" steps the environments with the same action again and again, "rollout" adds the policies and the write
 into the replay, "replay" gathers the minibatches, "update" is all that learning does, gathering included. The env
-steps/s of a part are those of a loop in which everything else is free. The floor is the time that the matrix
-products of a part alone take on these devices, measured just before and after (`benchmarks.limits`): "of floor" is
+steps/s of a part are those of a loop in which everything else is free. The roofline is the time that the matrix
+products of a part alone take on these devices, measured just before and after (`benchmarks.limits`): "roofline" is
 the share of a part's time that this would be.
 """
 
@@ -29,8 +29,9 @@ from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option
 from matd3_jax.core import replay
 from matd3_jax.runtime import devices
-from matd3_jax.training.loop import TrainLoop, TrainState
+from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.session import TrainingSession
+from matd3_jax.training.state import TrainState
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +59,7 @@ def main(argv: Sequence[str]) -> int:
     for key in ("machine", "versions", "commit", "gflops_before"):
         print(f"{key}: {report[key]}")
     print(f"{'seeds':>5} {'part':<12} {'env steps/s':>12} {'slowest':>10} {'fastest':>10} {'updates/s':>10} "
-          f"{'of floor':>9}", flush=True)  # fmt: skip
+          f"{'roofline':>9}", flush=True)  # fmt: skip
     rows = []
     for seeds in options.seeds:
         for row in measure(options.overrides, seeds, options.repeats, options.seconds):
@@ -87,8 +88,8 @@ def measure(
     for part, iteration in parts(trainer).items():
         if wanted is not None and part not in wanted:
             continue
-        # Cycles in one call: first a guess, then as many as take the wanted time; where compiling is dear (robots), the
-        # guess is called again and again instead.
+        # Iterations in one call: first a guess, then as many as take the wanted time; where compiling is slow (robots),
+        # the guess is called again and again instead.
         iterations, calls, compile_seconds = 2, 1, None
         for attempt in range(2):
             program = trainer.program(iteration, iterations)
@@ -103,7 +104,7 @@ def measure(
                 calls = max(1, round(wanted_calls))
                 break
             iterations = max(2, round(iterations * wanted_calls))
-        least = [_floor(trainer, part)]
+        least = [_roofline(trainer, part)]
         times = []
         for _ in range(repeats):
             begun = time.perf_counter()
@@ -112,7 +113,7 @@ def measure(
             jax.block_until_ready(state)
             times.append((time.perf_counter() - begun) / calls)
         iterations = program.iterations
-        least.append(_floor(trainer, part))
+        least.append(_roofline(trainer, part))
         steps = seeds * iterations * trainer.iteration_steps
         updates = seeds * iterations * trainer.rollouts_per_iteration * trainer.schedule.updates_per_collect
         rows.append(
@@ -130,16 +131,16 @@ def measure(
     return rows
 
 
-def _floor(trainer: TrainLoop, part: str) -> float:
+def _roofline(trainer: TrainLoop, part: str) -> float:
     """Least seconds of an iteration's part; 0 where there are no products in it."""
-    return limits.floor(trainer, 3, part)[0].seconds if part in ("rollout", "update", "loop") else 0.0
+    return limits.roofline(trainer, 3, part)[0].seconds if part in ("rollout", "update", "loop") else 0.0
 
 
 def parts(trainer: TrainLoop) -> dict[str, Callable[[TrainState, Any], Any]]:
     """What `TrainLoop.program` repeats for each part of the loop, by the part's name."""
     return {
         "environment": lambda s, h: _env_steps(trainer, s),
-        "rollout": lambda s, h: _collects(trainer, s, h),
+        "rollout": lambda s, h: _rollouts(trainer, s, h),
         "replay": lambda s, h: _gathers(trainer, s, h),
         "update": lambda s, h: _updates(trainer, s, h),
         "loop": trainer.iteration,
@@ -165,7 +166,7 @@ def matmul_gflops(repeats: int = 7) -> float:
     return round(2 * jax.device_count() * count * 1024 * 128 * 128 / float(np.median(times[1:])) / 1e9, 1)
 
 
-def _collects(trainer: TrainLoop, state: TrainState, hyper: Any) -> tuple[TrainState, Any]:
+def _rollouts(trainer: TrainLoop, state: TrainState, hyper: Any) -> tuple[TrainState, Any]:
     episodes = None
     for _ in range(trainer.rollouts_per_iteration):
         state, episodes = trainer.rollout(state, hyper)

@@ -1,9 +1,9 @@
 """`python -m experiments.all`: every experiment of the paper, one after another, and a summary of all claims.
 
 Takes the options of the single experiments and gives them to each. Whatever is finished is used as it is, so a call
-that was stopped goes on with the same command. `runs` and `out` are folders of folders here, one for each experiment;
+that was stopped resumes with the same command. `runs` and `out` are folders of folders here, one for each experiment;
 the summary is summary.md (summary_small.md) in `out`. `skip` leaves experiments out. An experiment that cannot be run
-(no memory, a setting that it does not take) is told of in the summary, and the next one follows.
+(no memory, a setting that it does not take) is reported in the summary, and the next one follows.
 """
 
 import dataclasses
@@ -69,7 +69,7 @@ def main(argv: Sequence[str]) -> int:
     lines: list[str] = []
     failed = 0
     for name, one in chosen.items():
-        runs_folder, out_folder = study.places(one, parsed[name])
+        runs_folder, out_folder = study.folders(one, parsed[name])
         more = [f"out={given.out / out_folder.name}"]
         more += [] if given.runs is None else [f"runs={given.runs / runs_folder.name}"]
         print(f"\n==== {name}", flush=True)
@@ -83,7 +83,7 @@ def main(argv: Sequence[str]) -> int:
             lines += [*verdict.lines(one.claims(Table({}))), "", f"Could not be run: {error}"]
             failed = 2
         except Stopped as stopped:
-            print("stopped; go on with the same command")
+            print("stopped; resume with the same command")
             return stopped.code
         lines.append("")
     small = any(options.scale == "small" for options in parsed.values())

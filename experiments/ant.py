@@ -1,4 +1,4 @@
-"""`python -m experiments.ant`: MATD3 beside MADDPG, IL-TD3 and single-agent TD3 on a robot shared out among agents.
+"""`python -m experiments.ant`: MATD3, MADDPG, IL-TD3 and single-agent TD3 on a robot shared out among agents.
 
 Figure 8 of the paper: deterministic evaluations along training, mean and standard deviation over seeds. `env` is any
 robot, `recipe` one of its recipes, the same for all algorithms (recipe=paper: the paper's settings, days on a CPU);
@@ -40,7 +40,7 @@ def settings(scale: str, options: AntOptions) -> dict[str, list[str]]:
     return {algo: [f"env={env}", f"recipe={options.recipe}", f"algo={algo}", *more] for algo in options.algos}
 
 
-def place(options: AntOptions) -> tuple[Path, Path]:
+def folders(options: AntOptions) -> tuple[Path, Path]:
     name = options.env or ("ant" if options.scale == "paper" else "half_cheetah")
     if options.scale == "small" and name != "half_cheetah":
         name = f"{name}_small"
@@ -115,7 +115,7 @@ STUDY = Study(
     keep=("eval_*",),
     evaluations=True,
     options=AntOptions,
-    place=place,
+    folders=folders,
     data="curves.csv",
     figure="curves.png",
 )

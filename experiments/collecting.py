@@ -1,6 +1,6 @@
 """The data of a study: what its folder holds, what run directories have, and whether that is what was asked for.
 
-`runs.json` beside the tidy table has, for each setting, the resolved settings, the machine with its versions, and the
+`runs.json` next to the tidy table has, for each setting, the resolved settings, the machine with its versions, and the
 run's summary ("not finished" without one).
 """
 
@@ -28,7 +28,7 @@ class Data:
     """Rows and facts of a study's settings, by label."""
 
     keys: Mapping[str, str]
-    """The table's columns that tell settings apart, and where each stands in the resolved settings (`algo.name`)."""
+    """The table's columns that distinguish settings, and where each stands in the resolved settings (`algo.name`)."""
     rows: dict[str, Table]
     facts: dict[str, dict[str, Any]]
 
@@ -49,7 +49,7 @@ class Data:
         return {int(seed) for seed in self.rows[label].values("seed")} if label in self.rows else set()
 
     def offer(self, label: str, rows: Table, facts: dict[str, Any]) -> bool:
-        """Put rows and facts in the place of those of a setting, unless these are better: finished where the new ones
+        """Replace the rows and facts of a setting by these, unless these are better: finished where the new ones
         are not, or of the same settings with more seeds. Whether they were taken."""
         if label in self.rows and not self.unfinished(label):
             same = not differences(self.facts[label]["settings"], facts["settings"])
@@ -122,8 +122,8 @@ def check(path: Path, wanted: Config) -> None:
     """Raise UserError if the run at `path` was made with other settings."""
     other = differences(RunDirectory.open(path)[1].to_dict(), wanted.to_dict())
     if other:
-        told = ", ".join(f"{key} {was} there, {asked} here" for key, (was, asked) in list(other.items())[:3])
-        raise UserError(f"{path} was made with other settings ({told}): remove it, or choose another runs=")
+        words = ", ".join(f"{key} {was} there, {asked} here" for key, (was, asked) in list(other.items())[:3])
+        raise UserError(f"{path} was made with other settings ({words}): remove it, or choose another runs=")
 
 
 # ---- run directories -------------------------------------------------------------------------------------------------

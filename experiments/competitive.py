@@ -84,9 +84,9 @@ def draw(table: Table, path: Path) -> None:
     figure, axes = figures.canvas(len(envs), width=2.9, height=3.6)
     for axis, env in zip(axes, envs, strict=True):
         values = normalized(table, env)
-        for place, pair in enumerate(PAIRINGS):
+        for position, pair in enumerate(PAIRINGS):
             if pair in values:
-                figures.bar(axis, place, values[pair], figures.COLORS[pair[0]])
+                figures.bar(axis, position, values[pair], figures.COLORS[pair[0]])
         axis.set_xticks(range(len(PAIRINGS)), [f"vs\n{figures.NAMES[single]}" for _, single in PAIRINGS], fontsize=8)
         for k, team in enumerate(ALGOS):  # below the opponents, the team: its bars have its color
             axis.text(

@@ -1,4 +1,4 @@
-"""`python -m experiments.cooperative`: MATD3 beside MADDPG on Cooperative Navigation and Cooperative Communication.
+"""`python -m experiments.cooperative`: MATD3 and MADDPG on Cooperative Navigation and Cooperative Communication.
 
 Figure 3 of the paper: mean return of the last 1,000 training episodes along training, with the 95 % interval of the
 mean."""

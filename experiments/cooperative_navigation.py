@@ -1,8 +1,8 @@
 """`python -m experiments.cooperative_navigation`: does it learn what the original learns?
 
-Trains MATD3 and MADDPG on simple_spread with the paper's settings (10,000 episodes of 25 steps) and lays the training
-returns over those of the authors' own program (experiments/reference). Writes the table of both (curves.csv), a figure
-(curves.png), a comparison (table.md) and the machine and versions (machine.json) into `out`.
+Trains MATD3 and MADDPG on simple_spread with the paper's settings (10,000 episodes of 25 steps) and compares the
+training returns with those of the authors' own program (experiments/reference). Writes the table of both (curves.csv),
+a figure (curves.png), a comparison (table.md) and the machine and versions (machine.json) into `out`.
 """
 
 import csv
@@ -20,10 +20,11 @@ from matplotlib.figure import Figure
 import matd3_jax
 from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option, others
-from matd3_jax.figures.learning_curves import curve
+from matd3_jax.figures import style
 from matd3_jax.runs.paths import check_directory
 from matd3_jax.runtime import devices
-from matd3_jax.stats.intervals import welch_interval
+from matd3_jax.stats.intervals import compare, t_interval
+from matd3_jax.stats.text import plus_minus
 
 HERE = Path(__file__).parent
 ALGORITHMS = {"matd3": "MATD3", "maddpg": "MADDPG"}
@@ -91,7 +92,9 @@ def report(out: Path) -> None:
         episodes, mine = ours[algo]
         axis.plot(theirs[algo][0], theirs[algo][1].T, color="black", linewidth=0.9, alpha=0.6)
         axis.plot([], [], color="black", linewidth=0.9, label=f"authors' program, {len(theirs[algo][1])} seeds, each")
-        curve(axis, episodes, mine, "tab:blue", f"this project, {len(mine)} seeds, mean and 95 % interval", each=True)
+        label = f"this project, {len(mine)} seeds, mean and 95 % interval"
+        style.band(axis, episodes, t_interval(mine), style.SERIES[0], label, seeds=mine)
+        style.dress(axis)
         axis.set_title(f"Cooperative Navigation: {ALGORITHMS[algo]}")
         axis.set_xlabel(f"episodes (mean over the last {BLOCK:,})")
         axis.legend(loc="lower right", frameon=False, fontsize=8)
@@ -102,7 +105,9 @@ def report(out: Path) -> None:
             other, a = other[~np.isnan(other)], mine[:, k]
             cells = [ALGORITHMS[algo], f"{int(episode):,}"]
             cells += [f"{v.mean():.1f} ({v.std(ddof=1):.1f}, {len(v)})" for v in (a, other)]
-            lines.append(f"| {' | '.join(cells)} | {a.mean() - other.mean():+.1f} ± {welch_interval(a, other):.1f} |")
+            test = compare(a, other)
+            cells.append(plus_minus(float(test.difference), float(test.high - test.low) / 2, "+.1f", ".1f"))
+            lines.append(f"| {' | '.join(cells)} |")
     figure.axes[0].set_ylabel("training return, summed over agents")
     figure.savefig(out / "curves.png", dpi=130)
     (out / "table.md").write_text("\n".join(lines) + "\n")

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 
-from experiments import figures
 from experiments.tidy import Table
-from matd3_jax.stats.intervals import mean_interval
+from matd3_jax.figures import style
+from matd3_jax.stats.intervals import Estimate, t_interval
+from matd3_jax.stats.text import NOTHING, ends, plus_minus, seeds
 
 RETURN, VELOCITY = "eval_return_agents", "eval_forward_velocity"
 COLUMNS = {RETURN: "return", VELOCITY: "forward velocity (m/s)"}
@@ -27,14 +28,15 @@ def late(part: Table, share: float = 1 / 3, column: str = RETURN) -> np.ndarray 
     return values[:, steps > (1 - share) * steps[-1]].mean(axis=1)
 
 
-def draw(axis: Axes, part: Table, column: str, color: str, label: str, style: str = "-") -> None:
+def draw(axis: Axes, part: Table, column: str, color: str, label: str, dashes: str = "solid") -> None:
     """Mean and standard deviation over the seeds of ONE setting."""
     found = curve(part, column)
     assert found is not None
     steps, curves = found
-    mean, spread = curves.mean(axis=0), curves.std(axis=0, ddof=1) if len(curves) > 1 else 0
-    axis.fill_between(steps, mean - spread, mean + spread, color=color, alpha=0.2, linewidth=0)
-    axis.plot(steps, mean, style, color=color, label=f"{label} ({figures.count(len(curves))})")
+    mean = curves.mean(axis=0)
+    deviation = curves.std(axis=0, ddof=1) if len(curves) > 1 else np.full_like(mean, np.nan)
+    estimate = Estimate(mean, mean - deviation, mean + deviation)
+    style.band(axis, steps, estimate, color, f"{label} ({seeds(len(curves))})", dashes)
     axis.set_xlabel("env steps of each seed")
     axis.set_ylabel(f"evaluation: {COLUMNS[column]}")
 
@@ -48,14 +50,16 @@ def row(part: Table) -> list[str]:
     assert found is not None
     steps, returns = found
     speed, final = curve(part, VELOCITY), returns[:, -1]
-    mean, half = mean_interval(final)
-    interval = f" ± {final.std(ddof=1):.0f} ({mean - half:.0f} to {mean + half:.0f})" if len(final) > 1 else ""
+    mean, low, high = t_interval(final)
+    last = plus_minus(mean, None, ".0f")
+    if len(final) > 1:
+        last = f"{plus_minus(mean, final.std(ddof=1), '.0f', '.0f')} ({ends(low, high, '.0f')})"
     return [
         str(len(final)),
         f"{int(steps[-1]):,}",
-        f"{mean:.0f}{interval}",
+        last,
         f"{returns.mean(axis=0).max():.0f}",
-        "—" if speed is None else f"{speed[1][:, -1].mean():.2f}",
+        NOTHING if speed is None else f"{speed[1][:, -1].mean():.2f}",
     ]
 
 

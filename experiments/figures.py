@@ -1,4 +1,4 @@
-"""How the figures and tables of the studies look: colors that the color-blind tell apart, bands, bars, intervals."""
+"""How the figures and tables of the studies look: names and colors of the algorithms, bands, bars, tables."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,20 +10,20 @@ from matplotlib.figure import Figure
 
 from experiments import tidy
 from experiments.tidy import Table
-from experiments.verdict import number
-from matd3_jax.stats.intervals import mean_interval
+from matd3_jax.figures import style
+from matd3_jax.figures.style import web
+from matd3_jax.stats.intervals import mean_interval, t_interval
+from matd3_jax.stats.text import NOTHING, ends, number, seeds
 
 NAMES = {"matd3": "MATD3", "maddpg": "MADDPG", "iltd3": "IL-TD3", "td3": "SA-TD3", "iddpg": "IDDPG", "ddpg": "DDPG"}
-COLORS = {  # Okabe and Ito's
-    "matd3": "#0072B2",
-    "maddpg": "#E69F00",
-    "iltd3": "#009E73",
-    "td3": "#CC79A7",
-    "iddpg": "#56B4E9",
-    "ddpg": "#D55E00",
+COLORS = {
+    "matd3": web(style.BLUE),
+    "maddpg": web(style.ORANGE),
+    "iltd3": web(style.GREEN),
+    "td3": web(style.PURPLE),
+    "iddpg": web(style.SKY_BLUE),
+    "ddpg": web(style.VERMILION),
 }
-SERIES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9")
-"""For what has no color of its own."""
 
 TASKS = {
     "simple_spread": "Cooperative Navigation",
@@ -52,42 +52,41 @@ def canvas(
     axes: list[Axes] = []
     for k in range(panels):
         axis = figure.add_subplot(rows, columns, k + 1)
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.grid(alpha=0.25)
+        style.dress(axis)
         axes.append(axis)
     return figure, axes
 
 
-def band(axis: Axes, x: np.ndarray, curves: np.ndarray, color: str, label: str, style: str = "-") -> None:
-    """Mean of curves [seeds, points] with its 95 % interval, the number of seeds in the legend."""
-    mean, half = mean_interval(curves)
-    if len(curves) > 1:
-        axis.fill_between(x, mean - half, mean + half, color=color, alpha=0.22, linewidth=0)
-    axis.plot(x, mean, style, color=color, label=f"{label} ({count(len(curves))})")
+def band(axis: Axes, x: np.ndarray, curves: np.ndarray, color: str, label: str, dashes: str = "solid") -> None:
+    """Draw the mean of curves [seeds, points] with its 95 % interval, the number of seeds in the legend."""
+    style.band(axis, x, t_interval(curves), color, f"{label} ({seeds(len(curves))})", dashes)
 
 
-def bar(axis: Axes, place: float, values: np.ndarray, color: str, width: float = 0.8) -> None:
+def bar(axis: Axes, position: float, values: np.ndarray, color: str, width: float = 0.8) -> None:
     """Mean of values [seeds] with its 95 % interval, and each of them as a dot."""
     mean, half = mean_interval(values)
-    axis.bar(place, mean, width, color=color, alpha=0.75, zorder=2)
+    axis.bar(position, mean, width, color=color, alpha=0.75, zorder=2)
     if len(values) > 1:
-        axis.errorbar(place, mean, half, color="black", capsize=3, linewidth=1.2, zorder=4)
-    across = place + np.linspace(-0.25, 0.25, len(values)) * width if len(values) > 1 else [place]
+        axis.errorbar(position, mean, half, color="black", capsize=3, linewidth=1.2, zorder=4)
+    across = position + np.linspace(-0.25, 0.25, len(values)) * width if len(values) > 1 else [position]
     axis.plot(across, values, ".", color="black", markersize=3, alpha=0.45, zorder=3)
 
 
-def count(seeds: int) -> str:
-    return f"{seeds} seeds" if seeds > 1 else "one seed"
+def point(axis: Axes, row: float, values: np.ndarray, color: str, offset: float = 0.0) -> None:
+    """Draw the mean of values [seeds] along x with its 95 % interval, and each of them as a dot `offset` above."""
+    mean, half = mean_interval(values)
+    axis.errorbar(mean, row, xerr=half if len(values) > 1 else 0.0, fmt="o", color=color, capsize=3)
+    axis.plot(values, np.full(len(values), row + offset), ".", color="black", markersize=3, alpha=0.5)
 
 
 def save(figure: Figure, path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-def learning(axis: Axes, table: Table, name: str, color: str, label: str, style: str = "-") -> None:
+def learning(axis: Axes, table: Table, name: str, color: str, label: str) -> None:
     """The mean return of the last episodes along training of ONE setting, a band over episodes in thousands."""
     episodes, means = tidy.trailing(table, name)
-    band(axis, episodes / 1000, means, color, label, style)
+    band(axis, episodes / 1000, means, color, label)
     axis.set_xlabel("episodes (thousands)")
 
 
@@ -104,7 +103,7 @@ def finals_table(table: Table, keys: Sequence[str], columns: Mapping[str, str]) 
         cells += [str(len(part.values("seed"))), f"{part.by_seed('step')[0, -1]:,.0f}"]
         finals = [tidy.final(part, name) for name in columns.values()]
         cells += [interval(final) for final in finals]
-        spreads = ["—" if f is None or len(f) < 2 or np.isnan(f).any() else f"{f.std(ddof=1):.3g}" for f in finals]
+        spreads = [NOTHING if f is None or len(f) < 2 or np.isnan(f).any() else f"{f.std(ddof=1):.3g}" for f in finals]
         lines.append(f"| {' | '.join([*cells, ', '.join(spreads)])} |")
     return lines
 
@@ -112,10 +111,8 @@ def finals_table(table: Table, keys: Sequence[str], columns: Mapping[str, str]) 
 def interval(values: np.ndarray | None) -> str:
     """Mean of values [seeds] and its 95 % interval in words."""
     if values is None or np.isnan(values).all():
-        return "—"
+        return NOTHING
     if np.isnan(values).any():
         return f"{np.isnan(values).sum()} of {len(values)} seeds diverged"
-    mean, half = mean_interval(values)
-    return f"{number(float(mean))}" + (
-        f" ({number(float(mean - half))} to {number(float(mean + half))})" if len(values) > 1 else " (one seed)"
-    )
+    mean, low, high = t_interval(values)
+    return f"{number(float(mean))} ({ends(float(low), float(high)) if len(values) > 1 else seeds(1)})"

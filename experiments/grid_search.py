@@ -18,7 +18,7 @@ from experiments.verdict import Claim
 from matd3_jax.cli import command
 from matd3_jax.cli.options import option
 from matd3_jax.errors import UserError
-from matd3_jax.stats.intervals import mean_interval
+from matd3_jax.figures.style import SERIES
 
 RATES = (0.01, 0.003, 0.001)
 GRIDS = {
@@ -62,7 +62,7 @@ def check(options: GridOptions) -> None:
         raise UserError("task=ant scale=small: the Ant is not trained in minutes; use task=particle, or scale=paper")
 
 
-def place(options: GridOptions) -> tuple[Path, Path]:
+def folders(options: GridOptions) -> tuple[Path, Path]:
     name = "grid_search" + ("_ant" if options.task == "ant" else "")
     name += "" if options.scale == "paper" else "_small"
     return Path("runs/experiments") / name, RESULTS / name
@@ -102,13 +102,13 @@ def claims(table: Table) -> list[Claim]:
     name = ", ".join(f"{key} {value:g}" for key, value in wanted.items())
     paper = f"{name} was found to work best"
     ranks = ranking(table)
-    place = next((k for k, (point, *_) in enumerate(ranks) if _is(point, wanted)), None)
-    if place is None or len(ranks) < 2:
-        return [Claim(paper, "final return: this setting less the best other one")]
-    other = ranks[1 if place == 0 else 0]
-    told = ", ".join(f"{key} {other[0][key]:g}" for key in wanted)
-    more = f"; it ranks {place + 1} of {len(ranks)} (to have picked the best of the others favors them)"
-    return [verdict.compare(paper, "final return", (name, ranks[place][1]), (told, other[1]), more=more)]
+    rank = next((k for k, (point, *_) in enumerate(ranks) if _is(point, wanted)), None)
+    if rank is None or len(ranks) < 2:
+        return [Claim(paper, "final return: this setting minus the best other one")]
+    other = ranks[1 if rank == 0 else 0]
+    best_other = ", ".join(f"{key} {other[0][key]:g}" for key in wanted)
+    more = f"; it ranks {rank + 1} of {len(ranks)} (to have picked the best of the others favors them)"
+    return [verdict.compare(paper, "final return", (name, ranks[rank][1]), (best_other, other[1]), more=more)]
 
 
 def _is(point: Mapping[str, float], wanted: Mapping[str, float]) -> bool:
@@ -119,18 +119,13 @@ def draw(table: Table, path: Path) -> None:
     ranks, wanted = ranking(table), best(table)
     figure, (axis,) = figures.canvas(1, width=6.2, height=1.2 + 0.27 * len(ranks))
     for k, (_, final, _) in enumerate(ranks):
-        mean, half = mean_interval(final)
-        color = figures.COLORS["matd3"]
-        if len(final) > 1:
-            axis.errorbar(mean, k, xerr=half, color=color, capsize=3, linewidth=1.2)
-        axis.plot(mean, k, "o", color=color)
-        axis.plot(final, np.full(len(final), k), ".", color="black", markersize=3, alpha=0.45)
+        figures.point(axis, k, final, figures.COLORS["matd3"])
     labels = [", ".join(f"{key} {point[key]:g}" for key in wanted) for point, *_ in ranks]
     axis.set_yticks(range(len(ranks)), labels, fontsize=8)
     for k, (label, (point, *_)) in enumerate(zip(axis.get_yticklabels(), ranks, strict=True)):
         if _is(point, wanted):
             label.set_fontweight("bold")
-            axis.axhspan(k - 0.45, k + 0.45, color=figures.SERIES[1], alpha=0.25, linewidth=0)
+            axis.axhspan(k - 0.45, k + 0.45, color=SERIES[1], alpha=0.25, linewidth=0)
     center = [final.mean() for _, final, _ in ranks]
     axis.set_ylim(len(ranks) - 0.4, -0.6)
     middle, reach = np.nanmedian(center), 1.3 * np.nanmax(np.abs(center - np.nanmedian(center))) + 1e-6
@@ -168,7 +163,7 @@ STUDY = Study(
     points=60,
     options=GridOptions,
     check=check,
-    place=place,
+    folders=folders,
 )
 
 

@@ -58,10 +58,10 @@ def claims(table: Table) -> list[Claim]:
         if len(values) > 1:
             number = np.concatenate([np.full(len(v), n) for n, v in values.items()])
             over = np.concatenate(list(values.values()))
-            told = ", ".join(f"{100 * v.mean():+.1f} % ({n} agents)" for n, v in values.items())
+            words = ", ".join(f"{100 * v.mean():+.1f} % ({n} agents)" for n, v in values.items())
             if min(map(len, values.values())) > 1 and np.ptp(over) > 0:
-                told += f"; all alike: p = {stats.kruskal(*values.values()).pvalue:.2g} (Kruskal and Wallis)"
-            claim = Claim(paper, claim.quantity, verdict.slope(number, over), "no difference", MARGIN, told)
+                words += f"; all alike: p = {stats.kruskal(*values.values()).pvalue:.2g} (Kruskal and Wallis)"
+            claim = Claim(paper, claim.quantity, verdict.slope(number, over), "no difference", MARGIN, words)
         found.append(claim)
     return found
 
@@ -70,8 +70,8 @@ def draw(table: Table, path: Path) -> None:
     figure, (axis,) = figures.canvas(1, width=5.2)
     for k, algo in enumerate(ALGOS):
         values = relative(table, algo)
-        for place, number in enumerate(values):
-            figures.bar(axis, place + 0.4 * (k - 0.5), 100 * values[number], figures.COLORS[algo], width=0.36)
+        for position, number in enumerate(values):
+            figures.bar(axis, position + 0.4 * (k - 0.5), 100 * values[number], figures.COLORS[algo], width=0.36)
         if values:
             seeds = "/".join(sorted({str(len(v)) for v in values.values()}))
             axis.bar(0, 0, color=figures.COLORS[algo], alpha=0.75, label=f"{figures.NAMES[algo]} ({seeds} seeds)")

@@ -1,7 +1,7 @@
 """`python -m experiments.overestimation`: how far the critics of MADDPG and MATD3 overestimate on Cooperative
 Navigation.
 
-Figure 1 of the paper: the critics' estimates beside the true discounted returns, both from states and actions stored
+Figure 1 of the paper: the critics' estimates and the true discounted returns, both from states and actions stored
 since the last evaluation, along training with episodes of 200 steps.
 """
 
@@ -15,6 +15,7 @@ from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
+from matd3_jax.stats.text import number
 
 ALGOS = ("maddpg", "matd3")
 
@@ -71,7 +72,10 @@ def claims(table: Table) -> list[Claim]:
     found = {algo: measured(part) for algo, part in parts.items()}
     over = {algo: None if f is None else f[1] - f[2] for algo, f in found.items()}
     truth = {algo: None if f is None else last(f[2]) for algo, f in found.items()}
-    mean_over, less_late = "MADDPG: estimate less true value, mean over training", "MADDPG: first third less last third"
+    mean_over, first_minus_last = (
+        "MADDPG: estimate minus true value, mean over training",
+        "MADDPG: first third minus last third",
+    )
     texts = {
         "over": "MADDPG overestimates",
         "early": "MADDPG overestimates especially in earlier episodes",
@@ -85,14 +89,14 @@ def claims(table: Table) -> list[Claim]:
         Claim(texts["over"], mean_over)
         if bias is None
         else Claim(texts["over"], mean_over, verdict.mean(bias.mean(axis=1)), found=_signs(bias.mean(axis=1))),
-        Claim(texts["early"], less_late)
+        Claim(texts["early"], first_minus_last)
         if bias is None
-        else Claim(texts["early"], less_late, verdict.mean(first(bias) - last(bias, 3)), found=_thirds(bias)),
-        Claim(texts["under"], "MATD3: true value less estimate, mean over training")
+        else Claim(texts["early"], first_minus_last, verdict.mean(first(bias) - last(bias, 3)), found=_thirds(bias)),
+        Claim(texts["under"], "MATD3: true value minus estimate, mean over training")
         if theirs is None
         else Claim(
             texts["under"],
-            "MATD3: true value less estimate, mean over training",
+            "MATD3: true value minus estimate, mean over training",
             verdict.mean(-theirs.mean(axis=1)),
             found=_signs(theirs.mean(axis=1)),
         ),
@@ -119,7 +123,7 @@ def _beyond_claims(rest: Mapping[str, np.ndarray | None]) -> list[Claim]:
     found = []
     for algo, sign, text in (("maddpg", 1, "MADDPG overestimates"), ("matd3", -1, "MATD3 underestimates")):
         text += ", beyond the targets' lag"
-        quantity = f"{figures.NAMES[algo]}: {'-' * (sign < 0)}(estimate less true value less lag), last two thirds"
+        quantity = f"{figures.NAMES[algo]}: {'-' * (sign < 0)}(estimate minus true value minus lag), last two thirds"
         values = rest[algo]
         if values is None:
             found.append(Claim(text, quantity))
@@ -145,12 +149,12 @@ def _final(table: Table) -> np.ndarray:
 
 
 def _signs(values: np.ndarray) -> str:
-    mean = verdict.number(float(values.mean()))
+    mean = number(float(values.mean()))
     return f"overestimation {mean}; above zero in {(values > 0).sum()} of {len(values)} seeds"
 
 
 def _thirds(over: np.ndarray) -> str:
-    early, late = (verdict.number(float(values.mean())) for values in (first(over), last(over, 3)))
+    early, late = (number(float(values.mean())) for values in (first(over), last(over, 3)))
     return f"overestimation {early} in the first third, {late} in the last (n = {len(over)})"
 
 
@@ -165,7 +169,7 @@ def draw(table: Table, path: Path) -> None:
             continue
         steps, estimate, truth = found
         figures.band(axis, steps / 1e6, estimate, figures.COLORS[algo], "critics' estimate")
-        figures.band(axis, steps / 1e6, truth, "#555555", "true value", "--")
+        figures.band(axis, steps / 1e6, truth, "#555555", "true value", "dashed")
         axis.legend(frameon=False)
         late = np.concatenate([values.mean(axis=0)[1 + len(steps) // 8 :] for values in (estimate, truth)])
         levels += [1.3 * late.min(initial=0.0), late.max(initial=0.0) + 10]  # the first ones lie far below
@@ -182,7 +186,7 @@ def draw(table: Table, path: Path) -> None:
         if levels:
             axis.set_ylim(min(levels), max(levels))
     axes[2].axhline(0, color="black", linewidth=0.8)
-    axes[2].set_ylabel("overestimation (estimate less true value)")
+    axes[2].set_ylabel("overestimation (estimate minus true value)")
     late = [line.get_ydata()[1 + len(line.get_ydata()) // 8 :] for line in axes[2].lines[:-1]]
     if late:  # the first evaluations, far above the others, would leave nothing to see of those
         late = np.concatenate(late)

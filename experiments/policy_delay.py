@@ -14,6 +14,7 @@ from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
+from matd3_jax.figures.style import SERIES
 
 ENVS = ("simple_spread", "simple_crypto")
 DELAYS = (1, 2, 3)
@@ -89,7 +90,7 @@ def draw(table: Table, path: Path) -> None:
     panels = [panel for panel in panels if panel[0] in table.values("env")]
     figure, axes = figures.canvas(len(panels), width=4.0)
     for axis, (env, column, label) in zip(axes, panels, strict=True):
-        for d, color in zip(DELAYS, figures.SERIES, strict=False):
+        for d, color in zip(DELAYS, SERIES, strict=False):
             part = table.where(env=env, policy_delay=d)
             if len(part):
                 figures.learning(axis, part, column, color, f"d = {d}")

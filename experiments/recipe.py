@@ -7,15 +7,14 @@ the base by the mean of its evaluations in the last third.
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from experiments import evaluations, figures, study, verdict
 from experiments.squashing import COMMON
 from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
-from matd3_jax.stats.intervals import mean_interval
+from matd3_jax.figures.style import SERIES
+from matd3_jax.stats.text import seeds
 
 BASE = "base"
 CHANGES: dict[str, list[str]] = {
@@ -101,14 +100,10 @@ def claims(table: Table) -> list[Claim]:
 def draw(table: Table, path: Path) -> None:
     there = {name: evaluations.late(part) for name, part in parts(table).items()}
     figure, (axis,) = figures.canvas(1, width=8.0, height=1.3 + 0.4 * len(there))
-    for place, (name, values) in enumerate(reversed(list(there.items()))):
+    for position, (name, values) in enumerate(reversed(list(there.items()))):
         assert values is not None
-        mean, half = mean_interval(values)
-        half = half if len(values) > 1 else 0.0
-        color = figures.SERIES[1 if name == BASE else 0]
-        axis.errorbar(mean, place, xerr=half, fmt="o", color=color, capsize=3)
-        axis.plot(values, np.full(len(values), place) + 0.2, ".", color="black", markersize=3, alpha=0.5)
-    axis.set_yticks(range(len(there)), [f"{name} ({figures.count(len(there[name]))})" for name in reversed(there)])
+        figures.point(axis, position, values, SERIES[1 if name == BASE else 0], offset=0.2)
+    axis.set_yticks(range(len(there)), [f"{name} ({seeds(len(there[name]))})" for name in reversed(there)])
     axis.set_xlabel("evaluations in the last third: mean and its 95 % interval over seeds")
     axis.set_ylim(-0.6, len(there) - 0.4)
     figure.suptitle("Ant, two halves, MATD3, 300,000 env steps: one part changed at a time", fontsize=10)

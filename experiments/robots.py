@@ -1,6 +1,6 @@
 """`python -m experiments.robots`: MATD3 with the fast recipe on robots shared out among two to six agents.
 
-One recipe for all of them; the Ant in two halves is in `experiments.ant`. Beside the returns stand those of HARL's
+One recipe for all of them; the Ant in two halves is in `experiments.ant`. The table also has the returns of HARL's
 MATD3 (Zhong et al. 2024), read off its figures.
 """
 

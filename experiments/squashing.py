@@ -13,6 +13,7 @@ from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
+from matd3_jax.figures.style import SERIES
 
 GRID = (("sigmoid", 0.001), ("sigmoid", 0.002), ("tanh", 0.0005), ("tanh", 0.001))
 MARGIN = 300.0
@@ -68,11 +69,11 @@ def draw(table: Table, path: Path) -> None:
     columns = [column for column in evaluations.COLUMNS if column in table]
     figure, axes = figures.canvas(len(columns), width=5.0, height=4.0)
     for axis, column in zip(axes, columns, strict=True):
-        for key, color in zip(GRID, figures.SERIES, strict=False):
+        for key, color in zip(GRID, SERIES, strict=False):
             part = table.where(actor_output=key[0], actor_lr=key[1])
             if len(part):
-                style = "-" if key[0] == "tanh" else "--"
-                evaluations.draw(axis, part, column, color, name(*key), style)
+                dashes = "solid" if key[0] == "tanh" else "dashed"
+                evaluations.draw(axis, part, column, color, name(*key), dashes)
     axes[0].legend(frameon=False, fontsize=8, loc="upper left", title="squashing, actors' learning rate")
     figure.suptitle("Ant, two halves, MATD3: mean ± sd over seeds")
     figures.save(figure, path)

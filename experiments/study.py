@@ -56,7 +56,7 @@ class Study:
         help: what the command says with --help.
         protocol: the paper's protocol in a sentence or two, with what it leaves open.
         settings: (scale, options) -> for each setting by label the overrides of `matd3_jax.train`.
-        keys: columns that tell the settings apart, and where each stands in the resolved settings.
+        keys: columns that distinguish the settings, and where each stands in the resolved settings.
         claims: what the paper found and what we found, from the rows of finished settings.
         draw: draws the figure from all rows into a file.
         details: lines of Markdown under the claims, from all rows.
@@ -65,7 +65,7 @@ class Study:
         evaluations: keep the rows with an evaluation only.
         options: `StudyOptions`, or a subclass with options of its own.
         check: raises UserError for options that do not go together.
-        place: (options) -> name of the folders under runs/experiments and experiments/results; default: NAME,
+        folders: (options) -> name of the folders under runs/experiments and experiments/results; default: NAME,
             NAME_small.
         data, figure: names of those files.
     """
@@ -84,7 +84,7 @@ class Study:
     evaluations: bool = False
     options: type[StudyOptions] = StudyOptions
     check: Callable[[Any], None] = lambda options: None
-    place: Callable[[Any], tuple[Path, Path]] | None = None
+    folders: Callable[[Any], tuple[Path, Path]] | None = None
     data: str = "data.csv"
     figure: str = "figure.png"
 
@@ -115,7 +115,7 @@ def run(study: Study, argv: Sequence[str]) -> list[Claim] | None:
     Raises UserError for options and directories that will not do, Stopped when a signal ended the training.
     """
     options = parse(study, argv)
-    folder, out = places(study, options)
+    folder, out = folders(study, options)
     for name, path in (("runs", folder), ("out", out)):
         check_directory(path, name)
     devices.prepare()
@@ -140,9 +140,9 @@ def run(study: Study, argv: Sequence[str]) -> list[Claim] | None:
             continue
         found = paths.get(label) or collecting.find(folder, label, settings)
         if found:
-            told = line_to_copy(f"experiments.{study.name}", *_told(argv))
+            command = line_to_copy(f"experiments.{study.name}", *_recorded(argv))
             how = {"keep": study.keep, "points": study.points, "evaluations": study.evaluations}
-            changed |= data.offer(label, *collecting.gather(study.keys, found, told, **how))
+            changed |= data.offer(label, *collecting.gather(study.keys, found, command, **how))
     if not data.rows:
         return None
     out.mkdir(parents=True, exist_ok=True)
@@ -171,16 +171,16 @@ def departures(study: Study, data: Data, options: StudyOptions) -> list[str]:
         options = dataclasses.replace(options, env=None)  # the paper's own environment
     paper = study.settings("paper", options)
     for label, fact in data.facts.items():
-        told = []
+        differences = []
         if label in paper:
             protocol = _load(tuple(paper[label]))
             other = collecting.differences(fact["settings"], protocol.to_dict())
             other = {key: pair for key, pair in other.items() if not key.startswith("adversary.")} or other
-            told += [f"{key} {was} ({asked})" for key, (was, asked) in other.items()]
+            differences += [f"{key} {was} ({asked})" for key, (was, asked) in other.items()]
             seeds = len(data.seeds(label))
-            told += [f"seeds {seeds} ({protocol.seeds})"] if seeds != protocol.seeds else []
-        if told:
-            lines.setdefault(", ".join(told), []).append(label)
+            differences += [f"seeds {seeds} ({protocol.seeds})"] if seeds != protocol.seeds else []
+        if differences:
+            lines.setdefault(", ".join(differences), []).append(label)
     found = []
     for what, labels in lines.items():
         who = "" if len(labels) == len(data.facts) else f" ({', '.join(labels)})"
@@ -207,10 +207,10 @@ def _overrides(options: StudyOptions) -> list[str]:
     return [*options.overrides, *([] if options.seeds is None else [f"seeds={options.seeds}"])]
 
 
-def places(study: Study, options: StudyOptions) -> tuple[Path, Path]:
+def folders(study: Study, options: StudyOptions) -> tuple[Path, Path]:
     """(folder of the run directories, folder of the results)."""
     name = study.name if options.scale == "paper" else f"{study.name}_small"
-    folder, out = study.place(options) if study.place else (Path("runs/experiments") / name, RESULTS / name)
+    folder, out = study.folders(options) if study.folders else (Path("runs/experiments") / name, RESULTS / name)
     return options.runs or folder, options.out or out
 
 
@@ -222,14 +222,14 @@ def _checked(study: Study, options: StudyOptions, overrides: Sequence[str]) -> d
     for override in config.parse(overrides):
         name = override.key_or_group
         if name in ("name", "resume", "checkpoint"):
-            raise UserError(f"cannot take {name}= here: the study names its runs and goes on with them by itself")
+            raise UserError(f"cannot take {name}= here: the study names its runs and resumes them by itself")
         if name in varied:
             raise UserError(f"cannot take {name}= here: the study itself varies it (only=PATTERN trains a part)")
     return lines
 
 
 def _merged(line: Sequence[str], overrides: Sequence[str]) -> list[str]:
-    """A setting's overrides with the user's in the place of those for the same keys."""
+    """A setting's overrides, with the user's instead of those for the same keys."""
     keys = {override.key_or_group for override in config.parse(overrides)}
     return [*(text for text in line if key(text) not in keys), *overrides]
 
@@ -244,6 +244,6 @@ def _load(overrides: tuple[str, ...]) -> Config:
     return config.load(overrides)
 
 
-def _told(argv: Sequence[str]) -> list[str]:
-    """The arguments worth recording: not where files lay."""
+def _recorded(argv: Sequence[str]) -> list[str]:
+    """The arguments worth recording: not where files are."""
     return [text for text in argv if key(text) not in ("runs", "out", "train")]

@@ -12,10 +12,11 @@ from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
+from matd3_jax.figures.style import SERIES
 
 LEVELS = (0, 0.1, 0.2, 0.4)
 MARGIN = 0.05
-"""Of what is learned without smoothing (final less untrained return): a smaller gain counts as none."""
+"""Of what is learned without smoothing (final minus untrained return): a smaller gain counts as none."""
 
 SCALES = {
     "paper": ["seeds=10", "total_steps=1500000", "log_every=12500"],
@@ -50,7 +51,7 @@ def claims(table: Table) -> list[Claim]:
 def draw(table: Table, path: Path) -> None:
     figure, (whole, late) = figures.canvas(2)
     lowest, highest = [], []
-    for sigma, color in zip(LEVELS, figures.SERIES, strict=False):
+    for sigma, color in zip(LEVELS, SERIES, strict=False):
         part = table.where(target_noise=sigma)
         if not len(part):
             continue

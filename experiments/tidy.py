@@ -40,7 +40,7 @@ class Table:
             column = self.columns.get(name)
             if column is None:
                 chosen[:] = False
-            elif column.dtype.kind == "U":  # also where numbers stand beside texts
+            elif column.dtype.kind == "U":  # also where numbers are mixed with texts
                 chosen &= column == (value if isinstance(value, str) else f"{value:g}")
             else:
                 chosen &= column == value

@@ -1,4 +1,4 @@
-"""What the paper found beside what we found: differences with intervals and tests, and a word for each claim.
+"""What the paper found compared with what we found: differences with intervals and tests, and a word for each claim.
 
 The word is decided by the 95 % confidence interval of one difference, which the paper's claim says is positive, or nil:
 
@@ -11,7 +11,7 @@ The word is decided by the 95 % confidence interval of one difference, which the
 
 Means are compared by Welch's t test, single means and differences within a seed by Student's, correlations by Fisher's
 transformation. p-values are two-sided. Where a table has several, Holm's correction for all of its claims of the kind
-"greater" stands beside them; the words go by the uncorrected intervals.
+"greater" is given, too; the words go by the uncorrected intervals.
 """
 
 import dataclasses
@@ -20,6 +20,9 @@ from typing import Literal
 
 import numpy as np
 from scipy import stats
+
+from matd3_jax.stats import intervals
+from matd3_jax.stats.text import NOTHING, ends, number
 
 DEFINITIONS = (
     "*Same*: the 95 % interval of the difference lies wholly on the side that the paper claims; for claims of no "
@@ -80,27 +83,13 @@ class Claim:
 
 
 def difference(a: np.ndarray, b: np.ndarray) -> Difference:
-    """Mean of a [n] less mean of b [m], seeds of two settings (Welch)."""
-    estimate = float(np.mean(a) - np.mean(b))
-    if min(len(a), len(b)) < 2:
-        return Difference(estimate, np.nan, np.nan, np.nan)
-    if np.ptp(a) == np.ptp(b) == 0:
-        return _certain(estimate)
-    test = stats.ttest_ind(a, b, equal_var=False)
-    low, high = test.confidence_interval(0.95)
-    return Difference(estimate, float(low), float(high), float(test.pvalue))
+    """Mean of a [n] minus mean of b [m], seeds of two settings (Welch)."""
+    return _of(intervals.compare(a, b))
 
 
 def mean(values: np.ndarray) -> Difference:
     """Mean of values [n] against zero (Student)."""
-    estimate = float(np.mean(values))
-    if len(values) < 2:
-        return Difference(estimate, np.nan, np.nan, np.nan)
-    if np.ptp(values) == 0:
-        return _certain(estimate)
-    test = stats.ttest_1samp(values, 0)
-    low, high = test.confidence_interval(0.95)
-    return Difference(estimate, float(low), float(high), float(test.pvalue))
+    return _of(intervals.compare(values, np.zeros_like(values), paired=True))
 
 
 def correlation(x: np.ndarray, y: np.ndarray) -> Difference:
@@ -143,8 +132,8 @@ def holm(p: Sequence[float]) -> list[float]:
     return found
 
 
-def _certain(estimate: float) -> Difference:
-    return Difference(estimate, estimate, estimate, 0.0 if estimate else 1.0)
+def _of(found: intervals.Comparison) -> Difference:
+    return Difference(*map(float, (found.difference, found.low, found.high, found.p)))
 
 
 # ---- claims ----------------------------------------------------------------------------------------------------------
@@ -161,19 +150,12 @@ def compare(
 ) -> Claim:
     """The claim that the mean of `first` is greater than that of `second` (or another `kind`): (name, values
     [seeds])."""
-    quantity = f"{quantity}: {first[0]} less {second[0]}"
+    quantity = f"{quantity}: {first[0]} minus {second[0]}"
     (one, a), (other, b) = first, second
     if a is None or b is None:
         return Claim(paper, quantity, kind=kind, margin=margin)
     found = ", ".join(f"{name} {number(v.mean())} (n = {len(v)})" for name, v in ((one, a), (other, b)))
     return Claim(paper, quantity, difference(a, b), kind, margin, found + more)
-
-
-def number(value: float) -> str:
-    """Four significant digits, thousands in full."""
-    if np.isnan(value):
-        return "—"
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
 def lines(claims: Sequence[Claim]) -> list[str]:
@@ -183,21 +165,21 @@ def lines(claims: Sequence[Claim]) -> list[str]:
     directed = {i: c.difference.p for i, c in enumerate(claims) if c.difference is not None and c.kind == "greater"}
     corrected = dict(zip(directed, holm(list(directed.values())), strict=True))
     for i, claim in enumerate(claims):
-        cells = [claim.paper, claim.quantity, claim.found or "—", "—", "—", "—", f"**{claim.verdict}**"]
+        cells = [claim.paper, claim.quantity, claim.found or NOTHING, NOTHING, NOTHING, NOTHING, f"**{claim.verdict}**"]
         if claim.difference is not None:
             d = claim.difference
             cells[3] = f"{'+' * (d.estimate > 0)}{number(d.estimate)} ({_interval(d)})"
             if claim.kind != "greater":
                 cells[3] += f"; margin {number(claim.margin)}"
             cells[4] = _p(d.p)
-            cells[5] = _p(corrected[i]) if i in corrected else "—"
+            cells[5] = _p(corrected[i]) if i in corrected else NOTHING
         table.append(f"| {' | '.join(cells)} |")
     return table
 
 
 def _interval(d: Difference) -> str:
-    return "no interval" if np.isnan(d.low) else f"{number(d.low)} to {number(d.high)}"
+    return "no interval" if np.isnan(d.low) else ends(d.low, d.high)
 
 
 def _p(p: float) -> str:
-    return "—" if np.isnan(p) else "< 0.0001" if p < 0.0001 else f"{p:.2g}"
+    return NOTHING if np.isnan(p) else "< 0.0001" if p < 0.0001 else f"{p:.2g}"

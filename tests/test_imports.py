@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1] / "src" / "matd3_jax"
 
 ALLOWED = {
     "core": {"envs", "errors"},
-    "envs": {"errors"},
+    "envs": {"errors", "private"},
     "stats": {"errors"},
 }
 """Of ours, what these packages may import besides themselves; the others are free, but for `cli`."""
@@ -98,6 +98,15 @@ def test_importing_the_package_loads_nothing_heavy():
 def test_libraries_are_imported_where_they_belong(library):
     users = {package(m) for m, path in MODULES.items() if any(n.split(".")[0] == library for n in imports(path))}
     assert users and users <= ONLY_IN[library]
+
+
+def test_private_modules_of_others_are_imported_nowhere():
+    """`private` looks them up when they are needed, and says what has moved."""
+    folders = [ROOT, *(ROOT.parents[1] / name for name in ("experiments", "benchmarks"))]
+    paths = [path for folder in folders for path in folder.rglob("*.py")]
+    found = {(path.name, name) for path in paths for name in imports(path) if not name.startswith("matd3_jax.")}
+    assert len(found) > 100
+    assert {pair for pair in found if any(p.startswith("_") and p[1:2] != "_" for p in pair[1].split("."))} == set()
 
 
 def test_there_are_no_circles():

@@ -2,18 +2,18 @@
 
 Parts, in this order; docs/performance_notes.md says what each takes:
     check       one update against the CPU's, single Ant steps against C MuJoCo, no copy of the replay in the loop
-    wall_clock  20 seeds x 60,000 episodes of simple_spread, and their returns beside the CPU's
+    wall_clock  20 seeds x 60,000 episodes of simple_spread, and their returns compared with the CPU's
     floor       the least time of an iteration: its products and bytes at the device's own rates
     launches    kernels of an iteration, and the share of the time in which none runs
     seeds       env steps/s over 1 to 1,024 seeds: whole loop, update, rollout
-    precision   float32 products beside the device's own (TF32), wall_clock too
+    precision   float32 products compared with the device's own (TF32), wall_clock too
     ant         whole loop of six seeds over environments, its launches, the physics alone, mjx and mjx_fast
     ant_wide    six seeds x 1M env steps of the Ant with recipe=wide, and what they learn
     unroll      longer bodies of the loops
     draws       random number generators, one draw an iteration
     options     command buffers, autotuning
 Everything is kept in DIR/report.json after each case, and what is there is not measured again: a run that was cut off
-goes on where it stood, and parts can be run one by one. No case begins after `minutes`. A check that fails stops
+resumes where it stopped, and parts can be run one by one. No case begins after `minutes`. A check that fails stops
 nothing, but is said before the table, and the exit code is 1. `scale=0.01` tries the whole on a small machine.
 """
 
@@ -22,9 +22,9 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from benchmarks.gpu import ant, ant_wide, checks, figure, floor, launches, seeds, targets, variants, wall_clock
+from benchmarks.gpu import ant, ant_wide, checks, figure, launches, roofline, seeds, targets, variants, wall_clock
 from benchmarks.gpu.report import Report
-from benchmarks.gpu.stretch import Length
+from benchmarks.gpu.timing import Length
 from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option
 from matd3_jax.runs.paths import check_directory
@@ -33,7 +33,7 @@ from matd3_jax.runtime import devices
 PARTS: dict[str, Callable[[Report, float, Length], None]] = {
     "check": lambda report, scale, length: checks.run(report),
     "wall_clock": lambda report, scale, length: wall_clock.run(report, scale),
-    "floor": lambda report, scale, length: floor.run(report, scale),
+    "floor": lambda report, scale, length: roofline.run(report, scale),
     "launches": launches.run,
     "seeds": seeds.run,
     "precision": variants.precision,

@@ -1,9 +1,9 @@
 """Env steps/s of the Ant: the whole loop of six seeds, its launches, and the physics alone over environments."""
 
 from benchmarks import robots
-from benchmarks.gpu import launches, stretch
+from benchmarks.gpu import launches, timing
 from benchmarks.gpu.report import Report, Row
-from benchmarks.gpu.stretch import Length
+from benchmarks.gpu.timing import Length
 
 SEEDS, STEPS = 6, 1_000_000
 """The paper's: env steps of each seed."""
@@ -30,10 +30,10 @@ def settings(num_envs: int, seeds: int, physics: str = "mjx") -> list[str]:
 
 
 def loop(seeds: int, num_envs: int, length: Length) -> Row:
-    row = stretch.measure(settings(num_envs, seeds), "loop", length)
+    row = timing.measure(settings(num_envs, seeds), "loop", length)
     return {"num_envs": num_envs, **row, "seconds_for_all": seeds * STEPS / row["env_steps_per_second"]}
 
 
 def physics_alone(physics: str, num_envs: int, length: Length) -> Row:
-    row = stretch.measure(settings(num_envs, 1, physics), "environment", length)
+    row = timing.measure(settings(num_envs, 1, physics), "environment", length)
     return {"num_envs": num_envs, "physics": physics, **row}

@@ -7,10 +7,11 @@ import jax
 import numpy as np
 
 from benchmarks.gpu.report import Report, Row
-from benchmarks.gpu.stretch import Length
+from benchmarks.gpu.timing import Length
 from experiments import evaluations, figures, tidy
 from experiments.tidy import Table
 from matd3_jax import config
+from matd3_jax.figures.style import SERIES
 from matd3_jax.training.session import TrainingSession
 
 SEEDS, STEPS = 6, 1_000_000
@@ -86,7 +87,7 @@ def draw(report: Report) -> None:
     figure, axes = figures.canvas(len(evaluations.COLUMNS), width=5.0, height=4.0)
     found = [name for name in UPDATES if (report.out / file(name)).exists()]
     for axis, column in zip(axes, evaluations.COLUMNS, strict=True):
-        for name, color in zip(found, figures.SERIES, strict=False):
+        for name, color in zip(found, SERIES, strict=False):
             table = tidy.read(report.out / file(name))
             label = name if name == "wide" else f"wide with {name}"
             evaluations.draw(axis, table, column, color, label)

@@ -23,7 +23,7 @@ PRODUCT, UPDATE, POSITION, VELOCITY = 5e-6, 1e-3, 1e-5, 2e-3
 
 
 def run(report: Report) -> None:
-    """What is wrong goes into `Report.wrong`: measuring goes on, as the machine may not come back."""
+    """What is wrong goes into `Report.wrong`: measuring continues, as the machine may not come back."""
     products = report.case("check", "products", lambda: {k: product_error(value) for k, value in PRECISIONS.items()})
     if products is not None and not products["float32"] < PRODUCT:
         report.wrong.append(f"products in float32 are off by {products['float32']:.2g}")
@@ -76,7 +76,7 @@ def replay_copies() -> int:
     """Copies of the whole replay in the optimized program of an interval."""
     trainer = TrainingSession(config.load(["seeds=4", "total_steps=100000"])).trainer
     state = trainer.abstract_state()
-    shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.layout.row_size)
+    shape = (trainer.sharding.padded_seeds, trainer.schedule.replay_capacity, trainer.layout.row_size)
     state = state._replace(replay=jax.ShapeDtypeStruct(shape, jnp.float32))
     text = trainer.interval(3).jitted.lower(state, trainer.hyper).compile().as_text()
     return copies_in(text, trainer)

@@ -2,6 +2,7 @@
 
 from benchmarks.gpu.report import Report, Row
 from experiments import figures
+from matd3_jax.figures.style import SERIES
 
 PANELS = {
     "seeds": ("simple_spread", "seeds", ("loop", "update", "rollout")),
@@ -17,7 +18,7 @@ def draw(report: Report) -> None:
     figure, axes = figures.canvas(len(there))
     for axis, (part, rows) in zip(axes, there.items(), strict=True):
         title, label, kinds = PANELS[part]
-        for kind, color in zip(kinds, figures.SERIES, strict=False):
+        for kind, color in zip(kinds, SERIES, strict=False):
             points = sorted(
                 (place(part, row), row["env_steps_per_second"])
                 for name, row in rows.items()

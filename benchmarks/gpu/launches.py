@@ -10,10 +10,10 @@ from typing import Any
 import jax
 from jax.profiler import ProfileData, ProfileOptions
 
-from benchmarks.gpu import seeds, stretch
+from benchmarks.gpu import seeds, timing
 from benchmarks.gpu.report import Report, Row
-from benchmarks.gpu.stretch import Compiled, Length
-from matd3_jax.training.loop import TrainState
+from benchmarks.gpu.timing import Compiled, Length
+from matd3_jax.training.state import TrainState
 
 STREAM = re.compile(r"Stream #")
 """Lines of a device's plane that hold what ran; the others show the same again, by module or by source."""
@@ -35,11 +35,11 @@ def measure(overrides: list[str], length: Length) -> Row:
 
     XLA leaves its command buffers (CUDA graphs) out while a profiler runs: what a kernel takes is the same, what lies
     between two of them is not. So "idle" is the share of the time WITHOUT the profiler that the kernels of the trace
-    leave, and "idle_traced" that of the traced stretch.
+    leave, and "idle_traced" that of the traced block.
     """
-    at = stretch.setting(overrides)
-    program = stretch.compiled(at, "loop", length.iterations)
-    state, row = stretch.timed(program, at.state, length)
+    at = timing.setting(overrides)
+    program = timing.compiled(at, "loop", length.iterations)
+    state, row = timing.timed(program, at.state, length)
     seen = trace(program, state)
     if seen is None:
         return {"cycle_seconds": row["cycle_seconds"], "device_stream": "none in the trace: no launches to count"}
@@ -55,7 +55,7 @@ def measure(overrides: list[str], length: Length) -> Row:
 
 
 def trace(program: Compiled, state: TrainState) -> Row | None:
-    """One call of the program under the profiler, as `read` tells it."""
+    """One call of the program under the profiler, as `read` sums it up."""
     options = ProfileOptions()
     options.host_tracer_level = options.python_tracer_level = 0  # the device only
     with tempfile.TemporaryDirectory() as folder:

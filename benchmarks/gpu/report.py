@@ -19,7 +19,7 @@ class Report:
 
     Args:
         out: made if it is not there. What an earlier run left there is kept, and measured cases are not measured again.
-        minutes: start no case after so many.
+        minutes: after which no case is started.
 
     Raises UserError where `out` holds numbers of other devices.
     """
@@ -60,7 +60,7 @@ class Report:
         row |= {"took_seconds": round(time.monotonic() - begun, 1), "commit": self.facts["commit"]}
         self.parts.setdefault(part, {})[name] = row
         self.save()
-        print(f"{part}: {name}: {told(row)}", flush=True)
+        print(f"{part}: {name}: {shown(row)}", flush=True)
         return None if "failed" in row else row
 
     def get(self, part: str, name: str) -> Row | None:
@@ -78,7 +78,7 @@ class Report:
         partial.replace(self.file)
 
 
-def told(row: Row) -> str:
+def shown(row: Row) -> str:
     """A row on one line; lists and what is the same for all are left to the file."""
     shown = {key: value for key, value in row.items() if not isinstance(value, list | dict) and key != "commit"}
     return ", ".join(f"{key} {number(value)}" for key, value in shown.items())

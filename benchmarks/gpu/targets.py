@@ -1,4 +1,4 @@
-"""The table that comes last: what was measured beside its target, and what bounds it."""
+"""The table that comes last: what was measured, its target, and what bounds it."""
 
 from typing import Any
 
@@ -43,14 +43,14 @@ def verdict(what: str, value: str, met: bool, target: str, full: bool = True) ->
 
 
 def bound(report: Report, seeds: int) -> list[str]:
-    """What is known of where the time of an iteration goes with so many seeds of simple_spread."""
+    """What is known of where the time of an iteration goes with `seeds` seeds of simple_spread."""
     found = shares(report.get("launches", f"simple_spread, {seeds} seeds"))
-    floor = report.get("floor", f"{seeds} seeds")
-    if floor is not None:
+    roofline = report.get("floor", f"{seeds} seeds")
+    if roofline is not None:
         found.append(
-            f"  floor of an iteration: {1e3 * floor['products_seconds']:.2f} ms of products, each at its own shape "
-            f"({floor['flops'] / floor['products_seconds'] / 1e12:.3g} TFLOP/s), {1e3 * floor['bytes_seconds']:.2f} ms "
-            "of memory traffic at least"
+            f"  roofline of an iteration: {1e3 * roofline['products_seconds']:.2f} ms of products, each at its own "
+            f"shape ({roofline['flops'] / roofline['products_seconds'] / 1e12:.3g} TFLOP/s), "
+            f"{1e3 * roofline['bytes_seconds']:.2f} ms of memory traffic at least"
         )
     return found
 

@@ -8,10 +8,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from benchmarks.gpu import seeds, stretch, wall_clock
+from benchmarks.gpu import seeds, timing, wall_clock
 from benchmarks.gpu.checks import PRECISIONS
 from benchmarks.gpu.report import Report, Row
-from benchmarks.gpu.stretch import Length
+from benchmarks.gpu.timing import Length
 from matd3_jax import config
 from matd3_jax.training.session import TrainingSession
 
@@ -38,7 +38,7 @@ UNROLL: dict[str, dict[str, int]] = {
 }
 GENERATORS = ("threefry2x32", "rbg", "unsafe_rbg")
 """Values of `jax_default_prng_impl`; the first is JAX's default. The others give a seed other numbers when other seeds
-run beside it, so they tell what random numbers cost and are no option."""
+run for comparison, so they show what random numbers cost and are no option."""
 
 
 def line(scale: float, count: int = 20) -> list[str]:
@@ -83,7 +83,7 @@ def _case(
 ) -> None:
     def measure() -> Row:
         with context():
-            return stretch.measure(overrides, "loop", length, **how)
+            return timing.measure(overrides, "loop", length, **how)
 
     report.case(part, name, measure)
 
@@ -109,7 +109,7 @@ def draw(overrides: list[str], large: bool, seconds: float, context: Callable[[]
 
         program = jax.jit(iterations)
         keys = training.keys()
-        rate = stretch.rate(lambda carry: program(*carry), (keys, jnp.zeros(len(keys))), seconds)
+        rate = timing.rate(lambda carry: program(*carry), (keys, jnp.zeros(len(keys))), seconds)
     return {"seeds": len(keys), "numbers_per_cycle": len(keys) * sum(sizes), "cycle_seconds": 1 / (rate * repeats)}
 
 

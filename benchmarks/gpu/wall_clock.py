@@ -11,6 +11,7 @@ from benchmarks.gpu.report import Report, Row
 from experiments import figures, tidy
 from experiments.tidy import Table
 from matd3_jax import config
+from matd3_jax.figures.style import SERIES
 from matd3_jax.stats import intervals
 from matd3_jax.training.session import TrainingSession
 
@@ -20,7 +21,7 @@ RECORDED = Path(__file__).parents[2] / "experiments" / "results" / "cooperative"
 SEEDS, STEPS, LOG_EVERY = 20, 1_500_000, 12_500
 RETURN = "return_agents"
 POINTS = (5_000, 10_000, 20_000, 40_000, 60_000)
-"""Episodes at which returns are laid beside the CPU's."""
+"""Episodes at which returns are compared with the CPU's."""
 
 
 def run(report: Report, scale: float) -> None:
@@ -62,7 +63,7 @@ def measure(name: str, precision: str | None, scale: float, out: Path) -> Row:
         "warm_up_seconds": warm_up,
         "compile_seconds": max(0.0, first - warm_up - interval),
         "env_steps_per_second": seeds * training.total_steps / seconds,
-        "returns": beside(table, recorded()),
+        "returns": compared(table, recorded()),
     }
 
 
@@ -70,9 +71,9 @@ def recorded() -> Table:
     return tidy.read(RECORDED).where(env="simple_spread", algo="matd3")
 
 
-def beside(ours: Table, theirs: Table) -> list[Row]:
-    """Mean returns of the last 1,000 episodes at `POINTS` (of a shorter run at its end), ours less theirs with the 95 %
-    interval of the difference and its p-value, of which chance alone brings one in twenty below 0.05."""
+def compared(ours: Table, theirs: Table) -> list[Row]:
+    """Mean returns of the last 1,000 episodes at `POINTS` (of a shorter run at its end), ours minus theirs with the
+    95 % interval of the difference and its p-value, of which chance alone brings one in twenty below 0.05."""
     (episodes, values), (their_episodes, their_values) = trailing(ours), trailing(theirs)
     end = min(episodes[-1], their_episodes[-1])
     found = []
@@ -97,7 +98,7 @@ def draw(out: Path) -> None:
     figure, (axis,) = figures.canvas(1, width=6.0, height=4.0)
     curves = {"CPU": recorded()}
     curves |= {f"here, {name}": tidy.read(out / f"simple_spread_{name}.csv") for name in ("default", "float32")}
-    for (label, table), color in zip(curves.items(), figures.SERIES, strict=False):
+    for (label, table), color in zip(curves.items(), SERIES, strict=False):
         if len(table):
             episodes, means = trailing(table)
             figures.band(axis, episodes / 1000, means, color, label)

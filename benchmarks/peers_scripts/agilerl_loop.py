@@ -100,8 +100,8 @@ def make_agent(case: dict, env) -> MATD3 | MADDPG:
     )
 
 
-def prepare(case: dict) -> serve.Stretch:
-    """Enough in the replay for a minibatch; a stretch is as many env steps as there are between two updates, with the
+def prepare(case: dict) -> serve.Block:
+    """Enough in the replay for a minibatch; a block is as many env steps as there are between two updates, with the
     update."""
     num_envs = case["num_envs"]
     makers = [lambda: OwnNames(case["episode_length"])] * num_envs
@@ -124,7 +124,7 @@ def prepare(case: dict) -> serve.Stretch:
         ended = [i for i in range(num_envs) if all(terminated[a][i] or truncated[a][i] for a in env.possible_agents)]
         agent.reset_action_noise(ended)
 
-    def stretch() -> int:
+    def block() -> int:
         torch.set_num_threads(case["threads"])
         for _ in range(case["learn_every"] // num_envs):
             play()
@@ -134,7 +134,7 @@ def prepare(case: dict) -> serve.Stretch:
     torch.set_num_threads(case["threads"])
     while len(memory) < case["batch_size"]:
         play()
-    return stretch
+    return block
 
 
 if __name__ == "__main__":

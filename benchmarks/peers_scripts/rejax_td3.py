@@ -1,7 +1,7 @@
 """rejax's TD3 on brax's hopper, its `train` compiled and mapped over seeds as its documentation shows.
 
 Case: {"seeds": n, "num_envs": n, "batch_size": n, "capacity": transitions in the replay, "steps": env steps of each
-seed in a stretch}. Networks are 64-64 (rejax has no other), with ReLU; one update for each env step; policy delay 2.
+seed in a block}. Networks are 64-64 (rejax has no other), with ReLU; one update for each env step; policy delay 2.
 """
 
 import jax
@@ -9,8 +9,8 @@ import serve
 from rejax import TD3
 
 
-def prepare(case: dict) -> serve.Stretch:
-    """Its replay filled to `fill_buffer` and compiled; a stretch is one call of `train`, all seeds counted."""
+def prepare(case: dict) -> serve.Block:
+    """Its replay filled to `fill_buffer` and compiled; a block is one call of `train`, all seeds counted."""
     unit = 2 * case["num_envs"]  # of its training iteration
     steps = max(1, round(case["steps"] / unit)) * unit
     algorithm = TD3.create(
@@ -39,13 +39,13 @@ def prepare(case: dict) -> serve.Stretch:
     state = jax.jit(algorithm.init_state if one else jax.vmap(algorithm.init_state))(keys[0] if one else keys)
     kept = [state]
 
-    def stretch() -> int:
+    def block() -> int:
         kept.append(jax.block_until_ready(train(kept.pop())))
         return case["seeds"] * steps
 
     while int(kept[0].global_step.min()) <= 2048:
-        stretch()
-    return stretch
+        block()
+    return block
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 JaxMARL's calling convention, `matd3_jax.interop.jaxmarl`).
 
 Case: {"suite": "ours" or "jaxmarl", "env": name, "options": {...}, "num_envs": n, "steps": of each environment in a
-stretch}.
+block}.
 """
 
 import jax
@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import serve
 
 
-def prepare(case: dict) -> serve.Stretch:
-    """Compiled; a stretch is one call of the program, all environments counted."""
+def prepare(case: dict) -> serve.Block:
+    """Compiled; a block is one call of the program, all environments counted."""
     env = make(case)
     num_envs, steps = case["num_envs"], case["steps"]
 
@@ -35,12 +35,12 @@ def prepare(case: dict) -> serve.Stretch:
     _, states = jax.jit(jax.vmap(env.reset))(reset_keys)
     kept = [(keys, states)]
 
-    def stretch() -> int:
+    def block() -> int:
         carry, _ = jax.block_until_ready(play(*kept.pop()))
         kept.append(carry)
         return num_envs * steps
 
-    return stretch
+    return block
 
 
 def make(case: dict):

@@ -1,17 +1,17 @@
 """Stepping alone of mpe2's simple_spread and gymnasium's Ant, one environment: random actions, drawn beforehand, and
-every episode that ends started anew. Case: {"suite": "mpe2" or "gymnasium", "steps": of a stretch}."""
+every episode that ends started anew. Case: {"suite": "mpe2" or "gymnasium", "steps": of a block}."""
 
 import itertools
 
 import serve
 
 
-def prepare(case: dict) -> serve.Stretch:
-    """A stretch goes on where the last one stopped."""
+def prepare(case: dict) -> serve.Block:
+    """A block continues where the last one stopped."""
     return {"mpe2": particles, "gymnasium": ant}[case["suite"]](case["steps"])
 
 
-def particles(steps: int) -> serve.Stretch:
+def particles(steps: int) -> serve.Block:
     """mpe2's parallel API; discrete actions and 25 steps an episode are its defaults, given all the same."""
     from mpe2 import simple_spread_v3
 
@@ -19,17 +19,17 @@ def particles(steps: int) -> serve.Stretch:
     env.reset(seed=0)
     actions = itertools.cycle([{agent: env.action_space(agent).sample() for agent in env.agents} for _ in range(1000)])
 
-    def stretch() -> int:
+    def block() -> int:
         for action in itertools.islice(actions, steps):
             env.step(action)
             if not env.agents:
                 env.reset()
         return steps
 
-    return stretch
+    return block
 
 
-def ant(steps: int) -> serve.Stretch:
+def ant(steps: int) -> serve.Block:
     """gymnasium's Ant-v5 with MuJoCo, as `gymnasium.make` makes it (1,000 steps an episode)."""
     import gymnasium
 
@@ -37,14 +37,14 @@ def ant(steps: int) -> serve.Stretch:
     env.reset(seed=0)
     actions = itertools.cycle([env.action_space.sample() for _ in range(1000)])
 
-    def stretch() -> int:
+    def block() -> int:
         for action in itertools.islice(actions, steps):
             _, _, terminated, truncated, _ = env.step(action)
             if terminated or truncated:
                 env.reset()
         return steps
 
-    return stretch
+    return block
 
 
 if __name__ == "__main__":

@@ -70,7 +70,7 @@ def test_counted_products():
     moving = batch * agents * (through_critic + own_actor)
     rollout = 200 * agents * actor
     wanted = 2 * 2 * (2 * update + moving + rollout)  # a multiplication and an addition; two seeds
-    shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.layout.row_size)
+    shape = (trainer.sharding.padded_seeds, trainer.schedule.replay_capacity, trainer.layout.row_size)
     state = trainer.abstract_state()._replace(replay=jax.ShapeDtypeStruct(shape, jnp.float32))
     traced = trainer.interval(3).jitted.trace(state, trainer.hyper)
     assert loop.product_flops(traced.jaxpr.jaxpr) / 3 == pytest.approx(wanted, rel=1e-3)

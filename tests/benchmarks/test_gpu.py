@@ -62,10 +62,10 @@ def test_replay_plan():
     trainer = TrainingSession(config.load(seeds.settings(64, 100_000))).trainer
     beside = seeds.fitting(trainer, 1e15, 10**9)
     assert beside == 10**9, "at most what was asked for"
-    row, budget = 4 * 127 * trainer.rows, 10e9
+    row, budget = 4 * 127 * trainer.sharding.padded_seeds, 10e9
     capacity = seeds.fitting(trainer, budget, 10**9)
-    together = trainer.mesh.size if trainer.on_cpu else trainer.rows
-    free = budget - trainer.rows * memory.seed_bytes(trainer) - together * memory.update_bytes(trainer)
+    together = trainer.mesh.size if trainer.on_cpu else trainer.sharding.padded_seeds
+    free = budget - trainer.sharding.padded_seeds * memory.seed_bytes(trainer) - together * memory.update_bytes(trainer)
     assert capacity % 100 == 0 and capacity * row <= free < (capacity + 100) * row
     with pytest.raises(ValueError, match="64 seeds need .* GB"):
         seeds.fitting(trainer, 1e8, 10**9)
@@ -124,8 +124,8 @@ def test_returns_beside_the_recorded_ones():
     """Half of the recorded seeds learn as the others do; 30 more return, which is what a defect would cost, shows."""
     table = wall_clock.recorded()
     odd, even = (table.take(table["seed"] % 2 == k) for k in (1, 0))
-    rows = wall_clock.beside(odd, even)
+    rows = wall_clock.compared(odd, even)
     assert [row["episodes"] for row in rows] == [5_000, 10_000, 20_000, 40_000, 60_000]
     assert all(row["p"] > 0.01 for row in rows)
     better = Table({**odd.columns, wall_clock.RETURN: odd[wall_clock.RETURN] + 30})
-    assert sum(row["p"] < 0.01 for row in wall_clock.beside(better, even)) >= 3
+    assert sum(row["p"] < 0.01 for row in wall_clock.compared(better, even)) >= 3

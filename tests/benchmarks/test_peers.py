@@ -21,14 +21,14 @@ import serve
 def prepare(case):
     if case.get("broken"):
         raise RuntimeError("first line\\nno such environment")
-    def stretch():
+    def block():
         print("noise on the standard output")
         if case.get("dies"):
             print("MemoryError: all gone", file=sys.stderr, flush=True)
             os._exit(3)
         time.sleep(case["pause"])
         return 10
-    return stretch
+    return block
 
 serve.serve(prepare, ("numpy", "no-such-package"))
 """

@@ -54,7 +54,7 @@ def test_swept(tmp_path: Path):
     line = [*TINY, *DISTRIBUTION[:2]]
     assert sweep.main([*line, *values, f"out={tmp_path}", "name=heads"]) == 0
     folder = tmp_path / "heads"
-    assert [len(piece) for piece in Sweep(folder).pieces] == [1, 1, 1, 1]
+    assert [len(batch) for batch in Sweep(folder).batches] == [1, 1, 1, 1]
     assert train.main([*line, "algo.critic_head=categorical", "adversary.critic_norm=layer", f"out={tmp_path}"]) == 0
     alone = next(path for path in tmp_path.iterdir() if path.name != "heads")
     (member,) = (folder / "runs").glob("*categorical*layer*")

@@ -13,7 +13,7 @@ from matd3_jax import config, lists
 from matd3_jax.cli import plot
 from matd3_jax.config.diff import label_differences
 from matd3_jax.errors import UserError
-from matd3_jax.figures import learning_curves
+from matd3_jax.figures import style
 from matd3_jax.runs import curves
 from matd3_jax.runs.directory import RunDirectory, together
 
@@ -144,11 +144,9 @@ def test_many_curves_can_be_told_apart(drawn, tmp_path):
     assert len(looks) == 12 and len(figure.legends) == 1 and axis.get_legend() is None
     assert axis.get_title() == "simple_spread, matd3"
     # No grey twins and no faint ones: each color has contrast to white, and to its neighbors in the order of drawing.
-    luminance = [
-        matplotlib.colors.to_rgb(color) @ np.array([0.2126, 0.7152, 0.0722]) for color in learning_curves.COLORS
-    ]
+    luminance = [matplotlib.colors.to_rgb(color) @ np.array([0.2126, 0.7152, 0.0722]) for color in style.SERIES]
     assert max(luminance) < 0.75
-    assert len({(k % len(learning_curves.COLORS), k % len(learning_curves.STYLES)) for k in range(35)}) == 35
+    assert len({(k % len(style.SERIES), k % len(style.STYLES)) for k in range(35)}) == 35
 
 
 @pytest.mark.parametrize(("name", "begins"), [("a.png", b"\x89PNG"), ("a.pdf", b"%PDF"), ("a.svg", b"<?xml")])

@@ -31,6 +31,7 @@ from matd3_jax.errors import UserError
 from matd3_jax.figures import q_bias as q_bias_figure
 from matd3_jax.runs import overestimation
 from matd3_jax.training import checkpoint
+from matd3_jax.training.evaluator import Evaluator
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.schedule import Schedule
 
@@ -208,8 +209,8 @@ def run(slots=SLOTS):
     state, _ = interval(state)
     states.append(plain(state))
     if slots:
-        measured = jax.tree.map(np.asarray, t.measure_q_bias(state, 3))
-        state = t.restart_reservoir(state)
+        measured = jax.tree.map(np.asarray, Evaluator(t).measure_q_bias(state, 3))
+        state = Evaluator(t).restart_reservoir(state)
     compilations = []
     jax.monitoring.register_event_duration_secs_listener(
         lambda event, seconds, **_: compilations.append(event) if "backend_compile" in event else None

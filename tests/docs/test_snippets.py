@@ -24,7 +24,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
 OWN = {
     "matd3_jax.train": {"resume", "checkpoint", *slurm.KEYS},
-    "matd3_jax.sweep": {"resume", "piece", *sweep.OPTIONS, *slurm.KEYS},
+    "matd3_jax.sweep": {"resume", "batch", *sweep.OPTIONS, *slurm.KEYS},
     "matd3_jax.plot": {"runs"},
     "matd3_jax.crossplay": {"runs"},
     "benchmarks.guard": {"record"},

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from matd3_jax.envs.robots.engines import contact_frame
-from matd3_jax.envs.robots.engines.quietly import collision_driver, mjx
+from matd3_jax.envs.robots.engines.quietly import mjx
+from matd3_jax.private import Moved, mjx_collisions
 
 pytestmark = pytest.mark.usefixtures("quick_jit")
 
@@ -82,13 +83,13 @@ def test_mjx_keeps_its_collision_functions_where_we_replace_one():
     stock = contact_frame.table()[contact_frame.PLANE_CAPSULE]
     assert stock.__module__ == "mujoco.mjx._src.collision_primitive"
     with contact_frame.as_in_c():
-        assert collision_driver._COLLISION_FUNC[contact_frame.PLANE_CAPSULE] is contact_frame.plane_capsule
+        assert mjx_collisions()[contact_frame.PLANE_CAPSULE] is contact_frame.plane_capsule
     assert contact_frame.table()[contact_frame.PLANE_CAPSULE] is stock
 
 
-def test_a_table_elsewhere_is_named(monkeypatch):
-    monkeypatch.delattr(collision_driver, "_COLLISION_FUNC")
-    with pytest.raises(RuntimeError, match="mujoco-mjx==3.17.0"):
+def test_a_table_without_the_pair_is_refused(monkeypatch):
+    monkeypatch.setattr(contact_frame, "PLANE_CAPSULE", ("no", "such pair"))
+    with pytest.raises(Moved, match="no collision function of plane and capsule"):
         contact_frame.table()
 
 

@@ -109,8 +109,8 @@ def test_hard_choices_and_boxes():
         np.testing.assert_allclose(played[:, 1:].mean(axis=1), found[:, 1], rtol=1e-5, atol=1e-5)
 
 
-def test_order_and_pieces(monkeypatch):
-    """Seeds x seeds: each row is what that pair plays alone, also where the pairs are cut into pieces."""
+def test_order_and_batches(monkeypatch):
+    """Seeds x seeds: each row is what that pair plays alone, also where the pairs are cut into batches."""
     pairs = pairs_of(3, 2, matched=False)
     together = meet(runs(), "mixed", "normal", pairs)
     for pair, row in zip(pairs, together, strict=True):

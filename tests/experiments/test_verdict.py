@@ -82,7 +82,7 @@ def test_too_few_seeds_decide_nothing():
     ],
 )
 def test_the_words(low, high, kind, word):
-    claim = Claim("the paper says", "a less b", Difference((low + high) / 2, low, high, 0.02), kind, margin=1.0)
+    claim = Claim("the paper says", "a minus b", Difference((low + high) / 2, low, high, 0.02), kind, margin=1.0)
     assert claim.verdict == word
     row = verdict.lines([claim, Claim("other", "quantity")])[2]
     assert f"| **{word}** |" in row and f"({low:g} to {high:g})" in row
@@ -97,7 +97,7 @@ def test_lines():
     ]
     lines = verdict.lines(claims)
     assert lines[2] == (
-        "| A is better | return: A less B | A 2.33 (n = 10), B 0.75 (n = 10) | +1.58 (-0.2055 to 3.365) | 0.079 "
+        "| A is better | return: A minus B | A 2.33 (n = 10), B 0.75 (n = 10) | +1.58 (-0.2055 to 3.365) | 0.079 "
         "| 0.079 | **not shown** |"
     )
     assert lines[3].endswith("| — | — | — | — | **not yet run** |")

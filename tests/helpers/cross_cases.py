@@ -50,8 +50,10 @@ def make(settings, env=None, number=0):
         shapes._replace(
             groups=groups,
             env=jax.tree.map(lambda shape: np.zeros(shape.shape, shape.dtype), shapes.env),
-            replay=jnp.zeros((trainer.rows, trainer.schedule.replay_capacity, training.layout.row_size)),
-            key=trainer.fill(training.keys()),
+            replay=jnp.zeros(
+                (trainer.sharding.padded_seeds, trainer.schedule.replay_capacity, training.layout.row_size)
+            ),
+            key=trainer.sharding.pad(training.keys()),
             rollouts=jnp.int32(2),
             statistics=statistics,
         ),

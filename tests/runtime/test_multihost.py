@@ -116,8 +116,8 @@ def test_a_single_task_is_alone():
     script = {name: value for name, value in STEP.items() if "STEP" not in name}
     for environ in (one, script, {}):
         assert slurm.detect({}, environ) is None
-    assert multihost.start({}) is multihost.ALONE
-    assert multihost.start(GIVEN | {"num_processes": "1", "process_id": "0"}) is multihost.ALONE
+    assert multihost.start({}) is multihost.SINGLE_PROCESS
+    assert multihost.start(GIVEN | {"num_processes": "1", "process_id": "0"}) is multihost.SINGLE_PROCESS
 
 
 @pytest.mark.parametrize(
@@ -201,9 +201,9 @@ def test_messages():
     def work(processes):
         own = {name: column[processes.share(7).seeds] for name, column in table.items()}
         found = [processes.gather(own), processes.agree([3, 15, 2][processes.index])]
-        found.append(processes.tell({"a": [processes.index]} if processes.first else None))
+        found.append(processes.broadcast({"a": [processes.index]} if processes.first else None))
         part = processes.part(2)
-        found.append(None if part is None else [part.agree(10 * part.index), part.tell(part.index)])
+        found.append(None if part is None else [part.agree(10 * part.index), part.broadcast(part.index)])
         processes.check_same("x", "settings")
         return found
 
@@ -215,7 +215,9 @@ def test_messages():
     for found in (first, second, third):
         assert found[1:3] == [15, {"a": [0]}]
     assert first[3] == second[3] == [10, 0] and third[3] is None
-    assert all(key.endswith("told") for key in store.values) and len(store.values) <= 3  # since the last collection
+    assert (
+        all(key.endswith("broadcast") for key in store.values) and len(store.values) <= 3
+    )  # since the last collection
 
 
 def test_other_settings_and_what_ends_one_end_all():
@@ -280,7 +282,7 @@ def alone(tmp_path_factory) -> Path:
 
 def test_two_processes_make_the_run_of_one(alone, tmp_path, quickly_compiled):
     """Four seeds on three devices and three on one; SIGTERM to the second alone. Both stop with one checkpoint, each
-    having written its part; this process goes on from it, to the run of one device."""
+    having written its part; this process resumes from it, to the run of one device."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         address = f"127.0.0.1:{free.getsockname()[1]}"
     options = quickly_compiled.keywords["compiler_options"] if isinstance(quickly_compiled, functools.partial) else ""
@@ -362,8 +364,8 @@ class OneAtATime(ocp.StandardCheckpointer):
             self.lock.release()
 
 
-def test_a_sweep_shares_the_seeds_of_each_piece(tmp_path, monkeypatch):
-    """Two processes: a piece of two runs, with three seeds (the third in the second process) and with one, and a piece
+def test_a_sweep_shares_the_seeds_of_each_batch(tmp_path, monkeypatch):
+    """Two processes: a batch of two runs, with three seeds (the third in the second process) and with one, and a batch
     of one seed, which the second process sits out. The same runs as in one process."""
     more = [*TINY, "eval_every=0", "total_steps=400", f"out={tmp_path}"]
     settings = {
@@ -382,7 +384,7 @@ def test_a_sweep_shares_the_seeds_of_each_piece(tmp_path, monkeypatch):
         return made.train()
 
     assert together(2, work)[0] == [0, 0]
-    assert runner.Sweep(tmp_path / "2").pieces == [["a", "b"], ["c"]] and (tmp_path / "2/runs/c/summary.json").exists()
+    assert runner.Sweep(tmp_path / "2").batches == [["a", "b"], ["c"]] and (tmp_path / "2/runs/c/summary.json").exists()
     del settings["c"]
     assert together(1, work)[0] == [0]
     assert {part.name for part in (tmp_path / "2/runs/a/checkpoints/400/state").iterdir()} == {"0", "2"}
@@ -393,4 +395,4 @@ def test_a_sweep_shares_the_seeds_of_each_piece(tmp_path, monkeypatch):
         saved = [checkpoint.verify(run / "checkpoints") for run in (several, one)]
         states = [checkpoint.restore_actors(path, TrainingSession(setting).trainer) for path in saved]
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), *(s.groups for s in states))
-    assert not (tmp_path / "2" / "pieces" / "0").exists()
+    assert not (tmp_path / "2" / "batches" / "0").exists()

@@ -1,4 +1,4 @@
-"""Settings into runs and pieces: what shares a program, what is missing, what fits; and the memory it takes."""
+"""Settings into runs and batches: what shares a program, what is missing, what fits; and the memory it takes."""
 
 import dataclasses
 import itertools
@@ -57,33 +57,35 @@ def test_settings_that_share_a_program_compile_to_the_same_text():
 def test_only_missing_seeds_are_planned(tmp_path):
     existing = {"a": load("seed=0", "seeds=3"), "other": load("algo.lr=0.1", "seeds=9"), "b": load("seed=5", "seeds=1")}
     assert batching.missing(load("seeds=7"), existing) == (["a", "b"], [3, 4, 6])
-    pieces = batching.pieces({"new": load("seeds=7")}, existing, tmp_path, lambda config: 100)
-    assert [[(run.name, run.seed, run.seeds) for run in piece] for piece in pieces] == [
+    batches = batching.batches({"new": load("seeds=7")}, existing, tmp_path, lambda config: 100)
+    assert [[(run.name, run.seed, run.seeds) for run in batch] for batch in batches] == [
         [("new-seeds_3_to_4", 3, 2), ("new-seeds_6_to_6", 6, 1)]
     ]
-    assert batching.pieces({"new": load("seeds=3")}, existing, tmp_path, lambda config: 100) == []
+    assert batching.batches({"new": load("seeds=3")}, existing, tmp_path, lambda config: 100) == []
     with pytest.raises(UserError, match="seed 2"):
         batching.missing(load("seeds=7"), {**existing, "again": load("seed=2", "seeds=1")})
 
 
 def test_seeds_that_do_not_fit_are_cut(tmp_path):
-    pieces = batching.pieces({"x": load("seeds=10"), "y": load("algo.lr=1", "seeds=3")}, {}, tmp_path, lambda config: 4)
-    runs = [run for piece in pieces for run in piece]
-    assert all(sum(run.seeds for run in piece) <= 4 for piece in pieces)
+    batches = batching.batches(
+        {"x": load("seeds=10"), "y": load("algo.lr=1", "seeds=3")}, {}, tmp_path, lambda config: 4
+    )
+    runs = [run for batch in batches for run in batch]
+    assert all(sum(run.seeds for run in batch) <= 4 for batch in batches)
     covered = [(run.algo.actor_lr, seed) for run in runs for seed in range(run.seed, run.seed + run.seeds)]
     assert sorted(covered) == sorted([(0.01, s) for s in range(10)] + [(1.0, s) for s in range(3)])
     assert {Path(run.out) for run in runs} == {tmp_path} and len({run.name for run in runs}) == len(runs)
 
 
-def test_packing_takes_no_more_pieces_than_needed():
-    """Against every way to cut the sequence of runs into consecutive pieces."""
+def test_packing_takes_no_more_batches_than_needed():
+    """Against every way to cut the sequence of runs into consecutive batches."""
     rng = np.random.default_rng(0)
     for _ in range(60):
         sizes = rng.integers(1, 5, rng.integers(1, 8))
         most = int(rng.integers(sizes.max(), 10))
         runs = [dataclasses.replace(load(), seeds=int(n), name=str(k)) for k, n in enumerate(sizes)]
         found = batching.packed(runs, most)
-        assert [run for piece in found for run in piece] == runs
+        assert [run for batch in found for run in batch] == runs
 
         def fits(cuts, sizes=sizes, most=most):
             ends = [0, *cuts, len(sizes)]
@@ -93,7 +95,7 @@ def test_packing_takes_no_more_pieces_than_needed():
             n for n in range(len(sizes)) if any(fits(c) for c in itertools.combinations(range(1, len(sizes)), n))
         )
         assert len(found) == fewest + 1
-        assert all(sum(run.seeds for run in piece) <= most for piece in found)
+        assert all(sum(run.seeds for run in batch) <= most for batch in found)
 
 
 # ---- memory ----------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Sweeps: members equal to runs made alone, resuming, pieces, the table, and one line for bad input."""
+"""Sweeps: members equal to runs made alone, resuming, batches, the table, and one line for bad input."""
 
 import csv
 import dataclasses
@@ -15,7 +15,7 @@ from matd3_jax.cli import sweep, train
 from matd3_jax.errors import UserError
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.sweep import launcher, ranking, runner
-from matd3_jax.sweep.runner import Piece, Sweep
+from matd3_jax.sweep.runner import Batch, Sweep
 from matd3_jax.training import checkpoint
 from matd3_jax.training.session import TrainingSession
 
@@ -44,14 +44,14 @@ def leaves(run: Path) -> dict[str, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def swept(tmp_path_factory) -> Path:
-    """A finished sweep of 2 x 2 settings with two seeds, in one piece."""
+    """A finished sweep of 2 x 2 settings with two seeds, in one batch."""
     out = tmp_path_factory.mktemp("sweeps")
     assert sweep.main([*TINY, *SWEPT, "seeds=2", "tensorboard=true", f"out={out}", "name=whole"]) == 0
     return out / "whole"
 
 
-def test_one_piece_holds_what_shares_a_program(swept):
-    assert len(Sweep(swept).pieces) == 1 and len(Sweep(swept).pieces[0]) == 4
+def test_one_batch_holds_what_shares_a_program(swept):
+    assert len(Sweep(swept).batches) == 1 and len(Sweep(swept).batches[0]) == 4
 
 
 def test_each_member_equals_the_same_run_made_alone(swept, tmp_path):
@@ -147,8 +147,8 @@ def test_a_sweep_that_diverged_everywhere_is_reported(swept, tmp_path):
         assert [row["diverged"] for row in csv.DictReader(file)] == ["2"] * 4
 
 
-def test_stopped_and_gone_on_with_it_is_the_same_sweep(swept, tmp_path, monkeypatch, capsys):
-    """A signal after the third interval; what is left is gone on with, to the same numbers."""
+def test_stopped_and_resumed_it_is_the_same_sweep(swept, tmp_path, monkeypatch, capsys):
+    """A signal after the third interval; it is resumed, to the same numbers."""
     advance, calls = TrainingSession.advance, []
 
     def counted(self, state):
@@ -166,23 +166,23 @@ def test_stopped_and_gone_on_with_it_is_the_same_sweep(swept, tmp_path, monkeypa
         assert (tmp_path / "cut" / "runs" / path.name / "metrics.csv").read_text() == (path / "metrics.csv").read_text()
         ours, theirs = leaves(tmp_path / "cut" / "runs" / path.name), leaves(path)
         assert all(np.array_equal(ours[name], theirs[name]) for name in theirs)
-    assert not (tmp_path / "cut" / "pieces" / "0").exists()  # its checkpoints, replays in them, are of no more use
+    assert not (tmp_path / "cut" / "batches" / "0").exists()  # its checkpoints, replays in them, are of no more use
 
 
-def test_pieces_are_jobs_of_their_own_and_cut_by_memory(swept, tmp_path, monkeypatch, capsys):
-    """With memory for two seeds: two pieces, trained apart, the same table in the end. What one process works at,
+def test_batches_are_jobs_of_their_own_and_cut_by_memory(swept, tmp_path, monkeypatch, capsys):
+    """With memory for two seeds: two batches, trained apart, the same table in the end. What one process works at,
     another leaves alone."""
     monkeypatch.setattr(runner, "fitting_seeds", lambda settings, budget: 4)
     assert sweep.main([*TINY, *SWEPT, "seeds=2", f"out={tmp_path}", "name=apart", "train=false"]) == 0
     folder = tmp_path / "apart"
-    assert [len(piece) for piece in Sweep(folder).pieces] == [2, 2]
-    assert sweep.main([f"resume={folder}", "piece=1"]) == 0
+    assert [len(batch) for batch in Sweep(folder).batches] == [2, 2]
+    assert sweep.main([f"resume={folder}", "batch=1"]) == 0
     assert Sweep(folder).finished(1) and not Sweep(folder).finished(0)
     assert not (folder / "table.csv").exists()
     with Sweep(folder)._taken(0) as mine:
         assert mine
         assert sweep.main([f"resume={folder}"]) == 1
-    assert "another process is at it" in capsys.readouterr().out
+    assert "another process trains it, skipped" in capsys.readouterr().out
     assert sweep.main([f"resume={folder}"]) == 0
     columns = ("setting", "seeds", "final_mean")
     tables = [
@@ -193,11 +193,26 @@ def test_pieces_are_jobs_of_their_own_and_cut_by_memory(swept, tmp_path, monkeyp
         assert ours[:2] == theirs[:2] and float(ours[2]) == pytest.approx(float(theirs[2]), rel=1e-4)
 
 
+def test_a_sweep_that_called_its_batches_pieces_is_read(swept, tmp_path, capsys):
+    copy = tmp_path / "copy"
+    shutil.copytree(swept, copy)
+    (copy / "batches.json").rename(copy / "pieces.json")
+    (copy / "table.csv").unlink()
+    old = Sweep(copy)
+    assert old.batches == Sweep(swept).batches and old.folder_of(0) == copy / "pieces" / "0"
+    old.add({"more": config.load([*TINY, "seeds=1", "algo.lr=0.5"])}, budget=10**10)
+    assert len(Sweep(copy).batches[-1]) == 1 and not (copy / "batches.json").exists()
+    shutil.rmtree(copy / "runs" / "more")
+    (copy / "pieces.json").write_text((swept / "batches.json").read_text())
+    assert sweep.main([f"resume={copy}"]) == 0
+    assert (copy / "table.csv").read_text() == (swept / "table.csv").read_text()
+
+
 def test_more_seeds_train_only_what_is_missing(swept, tmp_path, monkeypatch):
     copy = tmp_path / "copy"
     shutil.copytree(swept, copy)
     trained = []
-    monkeypatch.setattr(Piece, "train", lambda self, stop: trained.append([(m.seed, m.seeds) for m in self.members]))
+    monkeypatch.setattr(Batch, "train", lambda self, stop: trained.append([(m.seed, m.seeds) for m in self.members]))
     settings = {"lr_0.1-tau_0.01": config.load([*TINY, "algo.lr=0.1", "algo.tau=0.01", "seeds=3"])}
     with pytest.raises(UserError, match="not finished"):
         runner.train(settings, copy)
@@ -227,8 +242,8 @@ def test_a_launcher_trains_nothing_that_is_finished(swept, capfd):
         (["algo.lr=1,2", "memory=0.5"], "one seed needs"),
         (["algo.lr=1,2", "train=maybe"], "train=maybe"),
         (["algo.lr=1,2", "metric=return_agnets"], "did you mean 'return_agents'"),
-        (["algo.lr=1,2", "pice=3"], "did you mean 'piece'"),
-        (["algo.lr=1,2", "piece=0"], "piece= goes with resume="),
+        (["algo.lr=1,2", "bach=3"], "did you mean 'batch'"),
+        (["algo.lr=1,2", "batch=0"], "batch= goes with resume="),
         (["algo.lr=1,2", "launcher=submitti"], "no launcher is called 'submitti'"),
         (["algo.lr=1,2", "launcher.partition=gpu"], "say which launcher"),
         (["algo.lr=1,2", "launcher=basic", "launcher.partition=gpu"], "has no option 'partition'"),
@@ -244,7 +259,7 @@ def test_bad_input_gets_one_line_and_leaves_nothing(arguments, words, tmp_path):
 
 def test_bad_input_about_a_sweep_that_is_there(swept):
     for arguments, words in (
-        ([f"resume={swept}", "piece=1"], "pieces 0 to 0"),
+        ([f"resume={swept}", "batch=1"], "batches 0 to 0"),
         ([f"resume={swept}", "seeds=3"], "keeps its settings"),
         ([f"resume={swept}", "metric=return_agnets"], "did you mean 'return_agents'"),
         ([*TINY, f"out={swept.parent}", f"name={swept.name}", "algo.lr=1,2"], "is there already"),

@@ -41,10 +41,10 @@ def test_products_are_those_of_the_limits(settings):
     trainer, layout, schedule = found.trainer, found.layout, found.trainer.schedule
     by_part = {
         part: sum(n * product.flops for product, n in limits.products(trainer, part).items())
-        / (trainer.local_seeds * trainer.iteration_steps)
+        / (trainer.sharding.local_seeds * trainer.iteration_steps)
         for part in ("rollout", "loop")
     }
-    assert trainer.devices_per_seed == 1
+    assert trainer.sharding.devices_per_seed == 1
     assert cost.acting_flops(layout) == pytest.approx(by_part["rollout"], rel=1e-12)
     assert cost.step_flops(layout, schedule) == pytest.approx(by_part["loop"], rel=1e-12)
 
@@ -82,7 +82,7 @@ def test_the_expectation_by_hand(monkeypatch):
     settings = (*ANT, "total_steps=20000", "learning_starts=10000", "replay_capacity=20000")
     found = training(*settings, "eval_every=1000", "eval_episodes=3")
     layout, schedule, total = found.layout, found.trainer.schedule, found.total_steps
-    warm_up = found.trainer.warmup_steps
+    warm_up = found.trainer.schedule.warmup_steps
     assert warm_up < 10000 and 20000 <= total < 21000
     played = total + 12 * 3 * 1000  # evaluations after the warm-up and at 10,000, 11,000 ... 20,000
     flops = played * cost.acting_flops(layout) + (total - warm_up) * cost.update_flops(layout, schedule)

@@ -14,7 +14,8 @@ from ledger import ENDS, HYPER, LIMIT, Ledger, by_hand
 from matd3_jax.core import rollout, update
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
-from matd3_jax.training import loop
+from matd3_jax.training import sharding
+from matd3_jax.training.evaluator import Evaluator
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.schedule import Schedule
 
@@ -280,8 +281,8 @@ def test_devices_and_pieces_and_chunks_and_unrolling():
     """An odd number of seeds on one device, updated together, in one long interval whose loops hold several iterations
     and steps in an iteration: as on two devices, in three intervals."""
     several, states, _, metrics = main_run()
-    assert several.mesh.size == 2 and several.rows == 4
-    trainer = make([0, 1, 2], tau=1.0, devices=jax.devices()[:1], piece=3, unroll=2, unroll_steps=3)
+    assert several.mesh.size == 2 and several.sharding.padded_seeds == 4
+    trainer = make([0, 1, 2], tau=1.0, devices=jax.devices()[:1], seeds_together=3, unroll=2, unroll_steps=3)
     state, long = trainer.interval(3)(back(states[0], slice(0, 3)))
     same(plain(state), states[3], slice(0, 3), slice(0, 3))
     short = jax.tree.map(lambda *m: np.concatenate(m, axis=1)[:3], *metrics)
@@ -293,10 +294,10 @@ def test_seeds_apart(monkeypatch):
     """Networks of each seed in arrays of their own inside the program, as for large ones: the same numbers, in the same
     form."""
     together, states, _, metrics = main_run()
-    monkeypatch.setattr(loop, "APART_BYTES", 0)
+    monkeypatch.setattr(sharding, "APART_BYTES", 0)
     trainer = make([0, 1, 2], tau=1.0)
-    assert trainer.seeds_apart and not together.seeds_apart and trainer.local_seeds == 2
-    assert not make([0, 1, 2], devices=jax.devices()[:1], piece=3).seeds_apart  # updated in one batch
+    assert trainer.seeds_apart and not together.seeds_apart and trainer.sharding.local_seeds == 2
+    assert not make([0, 1, 2], devices=jax.devices()[:1], seeds_together=3).seeds_apart  # updated in one batch
     state, long = trainer.interval(3)(start(trainer, [0, 1, 2])[0])
     same(plain(state), states[3], slice(None), slice(None))
     short = jax.tree.map(lambda *m: np.concatenate(m, axis=1), *metrics)
@@ -307,10 +308,10 @@ def test_devices_that_share_a_seed():
     """One seed on two devices, half of each minibatch on each: as on one, and the same on both devices."""
     trainer = make([1], dataclasses.replace(SCHEDULE, batch_size=6), tau=1.0)
     assert (
-        make([0, 1, 2]).devices_per_seed == 1
-        and make([1], dataclasses.replace(SCHEDULE, batch_size=5)).devices_per_seed == 1
+        make([0, 1, 2]).sharding.devices_per_seed == 1
+        and make([1], dataclasses.replace(SCHEDULE, batch_size=5)).sharding.devices_per_seed == 1
     )
-    assert trainer.devices_per_seed == trainer.mesh.size == 2 and trainer.device_seeds()[1][1] == [0]
+    assert trainer.sharding.devices_per_seed == trainer.mesh.size == 2 and trainer.sharding.device_seeds()[1][1] == [0]
     alone = make([1], trainer.schedule, tau=1.0, devices_per_seed=1)
     ends = []
     for t in (trainer, alone):
@@ -331,7 +332,7 @@ def test_evaluate():
     trainer, _, _, _ = main_run()
     state, _ = start(trainer, [0, 1, 2])
     keys = jax.vmap(jax.random.key)(jnp.arange(3))
-    returns, lengths, _ = map(np.asarray, trainer.evaluate(state, keys, 40, deterministic=True))
+    returns, lengths, _ = map(np.asarray, Evaluator(trainer).evaluate(state, keys, 40, deterministic=True))
     assert returns.shape == (3, 40, 2) and lengths.shape == (3, 40)
     assert set(np.unique(lengths)) == {ENDS, LIMIT}
     # Reward at step t is total + 10 i; totals grow by the action's first entry, between 0 and 1.

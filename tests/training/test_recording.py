@@ -203,7 +203,7 @@ def test_checkpoints_come_by_time_but_take_a_twentieth_of_it_at_most(tmp_path, m
         state, row = training.start()
         module.run(training, state, row, save=save, save_first=True)
         saved[cost] = np.diff(steps) / (training.iterations_per_interval * training.trainer.iteration_steps)
-        assert steps[0] == training.trainer.warmup_steps
+        assert steps[0] == training.trainer.schedule.warmup_steps
     assert set(saved[0.0]) == {3} and len(saved[0.0]) >= 5
     assert set(saved[0.5]) == {10}  # twenty times half a minute
 

@@ -7,7 +7,7 @@ import pytest
 
 from matd3_jax.envs import OptionError, make
 from matd3_jax.envs.point_reach import PointState
-from matd3_jax.figures.palette import BLUE, DARK_GREY, GREEN, GREY, PALE_GREEN, PURPLE, VERMILION, YELLOW
+from matd3_jax.figures.style import BLUE, DARK_GREY, GREEN, GREY, PALE_GREEN, PURPLE, VERMILION, YELLOW
 from matd3_jax.video import particle, plane, point_reach
 
 SIDE = 300

@@ -11,7 +11,7 @@ import pytest
 from matd3_jax import config
 from matd3_jax.envs import make
 from matd3_jax.errors import UserError
-from matd3_jax.figures.palette import BLUE, VERMILION
+from matd3_jax.figures.style import BLUE, VERMILION
 from matd3_jax.video import frames, mujoco_renderer, opengl
 
 mujoco = pytest.importorskip("mujoco")

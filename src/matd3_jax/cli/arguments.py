@@ -63,14 +63,14 @@ class Sweep(OfProcesses):
         "that each process may use at once", default=None, metavar="GB", unit="gigabytes", above=0,
         otherwise="what is free",
     )  # fmt: skip
-    train: bool = option("false: only plan, and say how to train the pieces", default=True)
+    train: bool = option("false: only plan, and say how to train the batches", default=True)
     launcher: str | None = option(
-        "train the pieces as jobs of a Hydra launcher, e.g. submitit_slurm", default=None, metavar="NAME"
+        "train the batches as jobs of a Hydra launcher, e.g. submitit_slurm", default=None, metavar="NAME"
     )
     name: str | None = option("of the sweep's directory", default=None, metavar="NAME", otherwise="made from the time")
     out: Path = option("where the sweep's directory goes", default=Path("runs"))
     resume: Path | None = option("go on with this sweep", default=None, metavar="SWEEP_DIR")
-    piece: int | None = option("with resume: train this piece alone", default=None, metavar="K", least=0)
+    batch: int | None = option("with resume: train this batch alone", default=None, metavar="K", least=0)
     launcher_options: tuple[str, ...] = others("an option of the launcher", prefix="launcher.")
     settings: tuple[str, ...] = others("a setting, with one value or several")
 
@@ -211,7 +211,7 @@ SWEEP = Command(
     _python("sweep"), Sweep,
     usage=(
         "[env=NAME] [algo=NAME] [key=value ...] key=VALUES ... [option=value ...]",
-        "resume=SWEEP_DIR [piece=K] [metric=COLUMN]",
+        "resume=SWEEP_DIR [batch=K] [metric=COLUMN]",
     ),
     examples=(
         "python -m matd3_jax.sweep algo.lr=0.01,0.003,0.001 algo.policy_delay=1,2 seeds=4",

@@ -160,7 +160,7 @@ def _print(pairings: Pairings, names: Sequence[str], title: str) -> None:
 
 
 def _words(mean: Mean | None, team: int) -> str:
-    return "" if mean is None else heat_map.text(mean.value[team], mean.half[team])
+    return "" if mean is None else heat_map.text(mean, team)
 
 
 def _write(out: Path, pairings: Pairings, entrants: Sequence[Entrant], options: CrossPlay) -> None:

@@ -12,9 +12,10 @@ from matd3_jax.core.rollout import Evaluation
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import devices
 from matd3_jax.stats.intervals import mean_interval
+from matd3_jax.stats.text import plus_minus
 from matd3_jax.training import checkpoint
-from matd3_jax.training.loop import TrainState
 from matd3_jax.training.session import TrainingSession
+from matd3_jax.training.state import TrainState
 
 
 def main(argv: Sequence[str]) -> int:
@@ -36,8 +37,7 @@ def main(argv: Sequence[str]) -> int:
         found = training.evaluate(played, options.episodes, policy != "sampled", options.seed)
         for quantity, by_episode in _quantities(training, found):
             by_seed = by_episode.mean(axis=1)
-            mean, half = mean_interval(by_seed)
-            interval = f"{mean:.2f}" + (f" ± {half:.2f}" if settings.seeds > 1 else "")
+            interval = plus_minus(*mean_interval(by_seed), ".2f", ".2f")
             table.add_row(policy, quantity, *(f"{value:.2f}" for value in by_seed), interval)
             spread = by_episode.std(axis=1, ddof=1) if options.episodes > 1 else np.full(settings.seeds, np.nan)
             rows += [

@@ -13,8 +13,8 @@ from matd3_jax.config import Config
 from matd3_jax.errors import UserError, nearest
 from matd3_jax.figures import sweep as sweep_figure
 from matd3_jax.runs.directory import RunDirectory
-from matd3_jax.runtime import devices, multihost, slurm
-from matd3_jax.runtime.multihost import ALONE, Processes
+from matd3_jax.runtime import devices, files, multihost, slurm
+from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.sweep import batching, launcher, ranking, search_space
 from matd3_jax.sweep.runner import Sweep
 from matd3_jax.sweep.search_space import SearchSpace
@@ -38,8 +38,8 @@ def main(argv: Sequence[str]) -> int:
 
 def start(given: SweepOptions, argv: Sequence[str], processes: Processes) -> int:
     """A fresh sweep. argv: as it was typed, to be kept."""
-    if given.piece is not None:
-        raise UserError("piece= goes with resume=SWEEP_DIR")
+    if given.batch is not None:
+        raise UserError("batch= goes with resume=SWEEP_DIR")
     if given.launcher_options and given.launcher is None:
         raise UserError(f"{given.launcher_options[0]}: say which launcher, e.g. launcher=submitit_slurm")
     if given.launcher is not None:
@@ -62,11 +62,11 @@ def start(given: SweepOptions, argv: Sequence[str], processes: Processes) -> int
     folder = processes.same_directory(folder)
     sweep, facts = open_sweep(folder, processes)
     if given.launcher is not None:
-        code = launcher.launch(folder, len(sweep.pieces), given.launcher, given.launcher_options)
+        code = launcher.launch(folder, len(sweep.batches), given.launcher, given.launcher_options)
         return code or _report_if_finished(sweep, None, facts)
     if not given.train:
         if processes.first:
-            print(f"train a piece with: {_resume_line(folder)} piece=K (0 to {len(sweep.pieces) - 1})\n"
+            print(f"train a batch with: {_resume_line(folder)} batch=K (0 to {len(sweep.batches) - 1})\n"
                   f"then rank with: {_resume_line(folder)}")  # fmt: skip
         return 0
     return _train(sweep, None, facts)
@@ -80,9 +80,11 @@ def _plan(
     sweep = Sweep(folder, processes)
     runs = sweep.add(settings, None if memory is None else int(memory * 1e9))
     facts = {**facts, "runs": {name: [path.name for path in paths] for name, paths in runs.items()}}
-    (folder / "sweep.json").write_text(json.dumps(facts, indent=1) + "\n")
+    files.write_json(folder / "sweep.json", facts)
     seeds = sum(c.seeds for c in settings.values())
-    print(f"sweep directory: {folder}\n{len(settings)} settings, {seeds} seeds, {len(sweep.pieces)} pieces", flush=True)
+    print(
+        f"sweep directory: {folder}\n{len(settings)} settings, {seeds} seeds, {len(sweep.batches)} batches", flush=True
+    )
 
 
 def check_metric(settings: Iterable[Config], metric: str) -> None:
@@ -112,19 +114,19 @@ def read(overrides: Sequence[str], samples: int | None, seed: int) -> tuple[list
 
 
 def resume(folder: Path, given: SweepOptions, argv: Sequence[str], processes: Processes) -> int:
-    """Go on with a sweep: all pieces that are not finished, or one, then the table."""
+    """Resume a sweep: all batches that are not finished, or one, then the table."""
     for text in argv:
-        if options.key(text) not in ("resume", "piece", "metric"):
+        if options.key(text) not in ("resume", "batch", "metric"):
             raise UserError(f"cannot take {text!r} with resume=: a sweep keeps its settings")
     sweep, facts = open_sweep(folder, processes)
-    if given.piece is not None and given.piece >= len(sweep.pieces):
-        raise UserError(f"piece={given.piece}: {sweep.folder} has the pieces 0 to {len(sweep.pieces) - 1}")
+    if given.batch is not None and given.batch >= len(sweep.batches):
+        raise UserError(f"batch={given.batch}: {sweep.folder} has the batches 0 to {len(sweep.batches) - 1}")
     if given.metric is not None:
-        check_metric([member for k in range(len(sweep.pieces)) for member in sweep.members(k)], given.metric)
-    return _train(sweep, given.piece, {**facts, "metric": given.metric or facts["metric"]})
+        check_metric([member for k in range(len(sweep.batches)) for member in sweep.members(k)], given.metric)
+    return _train(sweep, given.batch, {**facts, "metric": given.metric or facts["metric"]})
 
 
-def open_sweep(folder: Path, processes: Processes = ALONE) -> tuple[Sweep, dict[str, Any]]:
+def open_sweep(folder: Path, processes: Processes = SINGLE_PROCESS) -> tuple[Sweep, dict[str, Any]]:
     """A sweep and its facts (command, metric, settings). Raises UserError if there is none."""
     try:
         return Sweep(folder, processes), json.loads((folder / "sweep.json").read_text())
@@ -132,22 +134,22 @@ def open_sweep(folder: Path, processes: Processes = ALONE) -> tuple[Sweep, dict[
         raise UserError(f"{folder} is no sweep directory: it has no sweep.json") from None
 
 
-def _train(sweep: Sweep, piece: int | None, facts: Mapping[str, Any]) -> int:
-    code = sweep.train(None if piece is None else [piece])
+def _train(sweep: Sweep, batch: int | None, facts: Mapping[str, Any]) -> int:
+    code = sweep.train(None if batch is None else [batch])
     if not sweep.processes.first:
-        return sweep.processes.tell()
+        return sweep.processes.broadcast()
     if code:
-        print(f"stopped; go on with: {_resume_line(sweep.folder)}")
-    return sweep.processes.tell(code or _report_if_finished(sweep, piece, facts))
+        print(f"stopped; resume with: {_resume_line(sweep.folder)}")
+    return sweep.processes.broadcast(code or _report_if_finished(sweep, batch, facts))
 
 
-def _report_if_finished(sweep: Sweep, piece: int | None, facts: Mapping[str, Any]) -> int:
-    left = [k for k in range(len(sweep.pieces)) if not sweep.finished(k)]
+def _report_if_finished(sweep: Sweep, batch: int | None, facts: Mapping[str, Any]) -> int:
+    left = [k for k in range(len(sweep.batches)) if not sweep.finished(k)]
     if not left:
         report(sweep, facts)
         return 0
-    print(f"not finished yet: piece {', '.join(map(str, left))}; go on with: {_resume_line(sweep.folder)}")
-    return 0 if piece is not None and piece not in left else 1
+    print(f"not finished yet: batch {', '.join(map(str, left))}; resume with: {_resume_line(sweep.folder)}")
+    return 0 if batch is not None and batch not in left else 1
 
 
 def _resume_line(folder: Path) -> str:

@@ -31,6 +31,7 @@ def clip(gradients: chex.ArrayTree, algorithm: Algorithm, stack_ndim: int, max_n
 
     gradients: leaves [*stack, ...] with `stack_ndim` stack axes.
     """
+    # Not a chain of optax: its clip has no stack; vmapped it is slower and rounds otherwise (but for powers of two).
     if algorithm.clip == "none":
         return gradients
     square = jax.tree.map(lambda g: jnp.sum(jnp.square(g), axis=tuple(range(stack_ndim, g.ndim))), gradients)

@@ -16,7 +16,7 @@ from matd3_jax.envs.spaces import ActionSpace, Box, Discrete, MultiDiscrete, Sim
 class Policy(Protocol):
     """How an actor's output becomes an action vector. Static and hashable.
 
-    Outputs and action vectors are [..., size]. Noise is drawn beforehand, in one piece for many steps.
+    Outputs and action vectors are [..., size]. Noise is drawn beforehand, at once for many steps.
     """
 
     @property

@@ -44,7 +44,7 @@ class EnvState(NamedTuple):
 
 
 class Episodes(NamedTuple):
-    """Sums over the episodes that ended in a stretch of play."""
+    """Sums over the episodes that ended in a rollout."""
 
     count: chex.Array
     episode_return: chex.Array
@@ -97,7 +97,7 @@ def collect(
     """
     num_envs = env_state.episode_step.shape[0]
     noise_key, step_key, reset_key = jax.random.split(key, 3)
-    # All noise of the stretch in one draw for each group, not one for each step.
+    # All noise of the rollout in one draw for each group, not one for each step.
     noise = _noise(layout, noise_key, (length, num_envs), random)
 
     def step(carry: EnvState, inputs):

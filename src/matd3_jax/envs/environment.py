@@ -24,7 +24,7 @@ class TimeStep(NamedTuple):
     terminated: chex.Array
     """Boolean scalar: the task itself ended, there is no value beyond."""
     truncated: chex.Array
-    """Boolean scalar: the time limit cut the episode, the value goes on."""
+    """Boolean scalar: the time limit cut the episode, the value continues."""
 
 
 class Environment(abc.ABC):

@@ -68,8 +68,8 @@ class PointReach(Environment):
         return (1 / self.num_agents,) * self.num_agents
 
     def reset(self, key: chex.PRNGKey) -> tuple[PointState, tuple[chex.Array, ...]]:
-        place = jax.random.uniform(key, (self.num_agents + 1, self.dim), minval=-1.0, maxval=1.0)
-        pos, target = place[:-1], place[-1]
+        positions = jax.random.uniform(key, (self.num_agents + 1, self.dim), minval=-1.0, maxval=1.0)
+        pos, target = positions[:-1], positions[-1]
         state = PointState(pos=pos, vel=jnp.zeros_like(pos), target=target, step=jnp.zeros((), jnp.int32))
         return state, self.observe(state)
 

@@ -19,8 +19,8 @@ from matd3_jax.core.rollout import PolicyParams
 from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.envs.environment import Environment
 from matd3_jax.envs.wrappers.joint_team import JointTeam
-from matd3_jax.training.loop import TrainState
 from matd3_jax.training.session import TrainingSession
+from matd3_jax.training.state import TrainState
 
 TEAMS = ("agents", "adversaries")
 """The two sides, in the order of every axis [teams]."""
@@ -55,10 +55,10 @@ class Side:
         """
         if not isinstance(self.env, JointTeam):
             return list(rollout.decide(self.layout, policy, [observation[i] for i in self.members], key))
-        (place,) = self.members
-        seen = jax.vmap(self.env.join)(state, observation)[place]
+        (agent,) = self.members
+        seen = jax.vmap(self.env.join)(state, observation)[agent]
         everybody: list = [None] * len(self.env.agents)
-        (everybody[place],) = rollout.decide(self.layout, policy, [seen], key)
+        (everybody[agent],) = rollout.decide(self.layout, policy, [seen], key)
         parts = jax.vmap(self.env.split)(tuple(everybody))
         return [parts[i] for i in self.env.members]
 
@@ -98,8 +98,8 @@ def team_of(training: TrainingSession, env: Environment, state: TrainState, team
     policy = jax.tree.map(lambda leaf: np.asarray(leaf)[:seeds], training.trainer.policy(state, average=True))
     actors, hyper = [], []
     for group in own.layout.groups:
-        places = [whole.place(who[i]) for i in group.members]
-        g, rows = places[0][0], [row for _, row in places]
+        found = [whole.place(who[i]) for i in group.members]
+        g, rows = found[0][0], [row for _, row in found]
         actors.append(jax.tree.map(lambda leaf, rows=rows: leaf[:, rows], policy.actors[g]))
         hyper.append(policy.hyper[g])
     statistics = policy.statistics
@@ -120,20 +120,20 @@ def play(
     Args:
         env: what both play in, without joining.
         teams: one for each of `TEAMS`.
-        pairs: [pairs, teams] places of the seeds in their runs.
-        deterministic: no noise at all; otherwise the policies act as they do while collecting.
+        pairs: [pairs, teams] indices of the seeds in their runs.
+        deterministic: no noise at all; otherwise the policies act as they do in training.
     """
     key = jax.random.fold_in(jax.random.key(seed), 2**31 - 1)
     devices = jax.devices()[: len(pairs)]
     share = -(-len(pairs) // len(devices))
     width = SIDE_BY_SIDE["cpu" if devices[0].platform == "cpu" else "other"]
-    piece = min(share, max(1, width // episodes)) * len(devices)
+    batch = min(share, max(1, width // episodes)) * len(devices)
     program = _program(env, tuple(team.side for team in teams), tuple(devices), episodes, deterministic)
     policies = jax.device_put(tuple(team.policy for team in teams))
     found = []
-    for start in range(0, len(pairs), piece):
-        # Pieces of one size, the last filled up with copies of its last pair: one program.
-        chosen = pairs[np.minimum(np.arange(start, start + piece), len(pairs) - 1)]
+    for start in range(0, len(pairs), batch):
+        # Batches of one size, the last filled up with copies of its last pair: one program.
+        chosen = pairs[np.minimum(np.arange(start, start + batch), len(pairs) - 1)]
         returns = np.asarray(program(policies, jnp.asarray(chosen), key), np.float64)
         found.append(returns.mean(axis=1)[: len(pairs) - start])
     return np.concatenate(found)

@@ -20,7 +20,7 @@ class Mean(NamedTuple):
     value: np.ndarray
     """[teams] (agents, adversaries)"""
     half: np.ndarray
-    """[teams] half width of the 95 % interval; nan where a run has too few seeds to tell."""
+    """[teams] half width of the 95 % interval; nan where a run has too few seeds."""
     pairs: int
 
 
@@ -35,8 +35,8 @@ class Row(NamedTuple):
 
 
 def pairs_of(agents: int, adversaries: int, matched: bool) -> np.ndarray:
-    """Places [pairs, 2] of the seeds that meet, of so many: each with each; matched (of equally many): the first with
-    the first, and so on."""
+    """Indices [pairs, 2] of the seeds that meet: each with each; matched (of equally many): the first with the first,
+    and so on."""
     if matched:
         return np.stack([np.arange(agents), np.arange(adversaries)], axis=1)
     return np.stack(np.meshgrid(np.arange(agents), np.arange(adversaries), indexing="ij"), axis=-1).reshape(-1, 2)
@@ -48,7 +48,7 @@ class Pairings(NamedTuple):
     runs: np.ndarray
     """[rows, teams] numbers of the agents' run and the adversaries' run."""
     seeds: np.ndarray
-    """[rows, teams] places of the seeds in them."""
+    """[rows, teams] indices of the seeds in them."""
     returns: np.ndarray
     """[rows, teams] mean returns over the episodes."""
     matched: bool
@@ -102,7 +102,7 @@ class Pairings(NamedTuple):
     def _without(self, cells: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
         """For each run (matched: for all as one) the mean without each of its seeds that plays in the cells
         [seeds, teams]; nan where that leaves a cell empty."""
-        # Matched, everything with the same place shares a seed. Otherwise only the same seed of the same run does.
+        # Matched, everything with the same index shares a seed. Otherwise only the same seed of the same run does.
         strata = np.zeros_like(self.runs) if self.matched else self.runs
         width = int(self.seeds.max()) + 1
         units = strata * width + self.seeds

@@ -10,8 +10,8 @@ import numpy as np
 
 from matd3_jax.core import rollout
 from matd3_jax.core.agents import JointLayout
-from matd3_jax.training.loop import TrainState
 from matd3_jax.training.session import TrainingSession
+from matd3_jax.training.state import TrainState
 
 
 class Episode(NamedTuple):
@@ -80,9 +80,9 @@ def play(
 
     Args:
         state: what was trained, leading axis [seeds].
-        seed: place of the seed in the run, from 0.
-        deterministic: no noise at all; otherwise the policies act as they do while collecting.
-        max_steps: stop after so many env steps.
+        seed: index of the seed in the run, from 0.
+        deterministic: no noise at all; otherwise the policies act as they do in training.
+        max_steps: env steps after which to stop.
         keep: what to keep of a state of the environment; by default all of it.
     """
     steps = training.env.episode_length if max_steps is None else min(max_steps, training.env.episode_length)

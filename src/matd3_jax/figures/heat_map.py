@@ -11,15 +11,16 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from matd3_jax.evaluation.cross_play import TEAMS
-from matd3_jax.evaluation.cross_play_table import Pairings
+from matd3_jax.evaluation.cross_play_table import Mean, Pairings
+from matd3_jax.stats.text import plus_minus
 
 
 def draw(path: Path, names: Sequence[str], pairings: Pairings, title: str) -> None:
     """Write the picture: rows are the runs of the agents, columns those of the adversaries.
 
     In each cell stands the mean return with its interval; a run against itself is framed, and the pairs trained
-    together stand there apart. A cell's color is the mean over the others, where there are others. The colors are
-    told apart by color-blind eyes, and in grey.
+    together stand there apart. A cell's color is the mean over the others, where there are others. The colors can
+    be distinguished with any color vision, and in grey.
     """
     n = len(names)
     longest = max(len(name) for name in names)
@@ -37,8 +38,8 @@ def draw(path: Path, names: Sequence[str], pairings: Pairings, title: str) -> No
                 shown = own if cross is None else cross
                 assert shown is not None
                 values[i, j] = shown.value[t]
-                words = [text(cross.value[t], cross.half[t])] if cross is not None else []
-                words += ["own " + text(own.value[t], own.half[t])] if own is not None else []
+                words = [text(cross, t)] if cross is not None else []
+                words += ["own " + text(own, t)] if own is not None else []
                 texts[i, j] = "\n".join(words).replace(" ± ", "\n± ")
         image = axis.imshow(np.ma.masked_invalid(values), cmap=colormaps["cividis"].with_extremes(bad="lightgrey"))
         for (i, j), label in texts.items():
@@ -59,6 +60,6 @@ def draw(path: Path, names: Sequence[str], pairings: Pairings, title: str) -> No
     figure.savefig(path, dpi=120)
 
 
-def text(value: float, half: float) -> str:
-    """A mean with its interval; without one where there is none."""
-    return f"{value:.2f}" + ("" if np.isnan(half) else f" ± {half:.2f}")
+def text(mean: Mean, team: int) -> str:
+    """Write a team's mean return with the half width of its interval."""
+    return plus_minus(mean.value[team], mean.half[team], ".2f", ".2f")

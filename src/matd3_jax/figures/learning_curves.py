@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import matplotlib
 import numpy as np
@@ -12,25 +12,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from matd3_jax.errors import UserError
+from matd3_jax.figures import style
 from matd3_jax.runs.metrics import by_seed
-from matd3_jax.stats.intervals import Estimate, mean_interval
-
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Told apart by all kinds of color vision: Okabe and Ito 2008, without the yellow, which is faint on white."""
-
-STYLES = ("solid", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5)), (0, (8, 2)))
-"""As many as stand apart; 5 and the 7 colors have no common factor, so 35 lines differ in one or the other."""
+from matd3_jax.stats.intervals import Estimate, t_interval
 
 FORMATS = (".png", ".pdf", ".svg")
-
-PAPER: dict[Any, Any] = {
-    "font.size": 9,
-    "axes.titlesize": 9,
-    "legend.fontsize": 8,
-    "pdf.fonttype": 42,
-    "svg.fonttype": "none",
-}
-"""Sizes in points, for a picture that is printed at its own size; letters stay letters in PDF and SVG."""
 
 
 class Line(NamedTuple):
@@ -64,9 +50,9 @@ def check(path: Path) -> Path:
 def compare(
     path: Path, panels: Sequence[Panel], x_label: str, title: str = "", caption: str = "", each: bool = False
 ) -> None:
-    """Draw lines with bands, side by side in panels, in colors and dashes that can be told apart.
+    """Draw lines with bands, side by side in panels, in colors and dashes that can be distinguished.
 
-    The legend stands beside the panels where there are many lines or panels, or else in a free corner.
+    The legend is to the right of the panels where there are many lines or panels, or else in a free corner.
 
     Args:
         caption: over the legend.
@@ -75,14 +61,15 @@ def compare(
     columns = min(len(panels), 2)
     rows = math.ceil(len(panels) / columns)
     width, height = 3.3 * columns + 1.2, 0.4 + 2.6 * rows
-    with matplotlib.rc_context(PAPER):
+    with matplotlib.rc_context(style.PRINTED):
         figure = Figure(figsize=(width, height), layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.subplots(rows, columns, squeeze=False, sharex=True).ravel()
         for k, (axis, panel) in enumerate(zip(axes, panels, strict=False)):
             for i, line in enumerate(panel.lines):
-                _draw(axis, line, COLORS[i % len(COLORS)], STYLES[i % len(STYLES)], each)
-            _dress(axis)
+                color, dashes = style.SERIES[i % len(style.SERIES)], style.STYLES[i % len(style.STYLES)]
+                style.band(axis, line.x, line.estimate, color, line.label, dashes, line.seeds if each else None)
+            style.dress(axis)
             axis.set_ylabel(panel.y_label)
             axis.xaxis.set_major_formatter(EngFormatter(sep=""))
             if k + columns >= len(panels):
@@ -91,34 +78,20 @@ def compare(
         for axis in axes[len(panels) :]:
             axis.set_visible(False)
         if title:
-            (figure.suptitle if len(panels) > 1 else axes[0].set_title)(title, fontsize=PAPER["axes.titlesize"])
-        style = {"title": caption or None, "frameon": False, "handlelength": 3, "alignment": "left"}
+            (figure.suptitle if len(panels) > 1 else axes[0].set_title)(title, fontsize=style.PRINTED["axes.titlesize"])
+        frame = {"title": caption or None, "frameon": False, "handlelength": 3, "alignment": "left"}
         if len(panels[0].lines) > 4 or len(panels) > 1:
-            legend = figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right upper", **style)
+            legend = figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right upper", **frame)
         else:
-            legend = axes[0].legend(loc="best", **style)
-        legend.get_title().set_fontsize(PAPER["legend.fontsize"])
-        if legend.axes is None:  # beside the panels: they keep their size
+            legend = axes[0].legend(loc="best", **frame)
+        legend.get_title().set_fontsize(style.PRINTED["legend.fontsize"])
+        if legend.axes is None:  # to the right of the panels: they keep their size
             extent = legend.get_window_extent(figure.canvas.get_renderer())
             figure.set_size_inches(width + extent.width / figure.dpi, max(height, extent.height / figure.dpi + 0.2))
         try:
             figure.savefig(path, dpi=200)
         except OSError as error:
             raise UserError(f"cannot write {path}: {error.strerror}") from error
-
-
-def _draw(axis, line: Line, color: str, style, each: bool) -> None:
-    middle, low, high = line.estimate
-    dot = {"marker": "o", "markersize": 3} if len(line.x) == 1 else {}  # or nothing would be seen
-    if each and len(line.seeds) > 1:
-        axis.plot(line.x, line.seeds.T, color=color, linewidth=0.5, alpha=0.35, **dot)
-    axis.fill_between(line.x, low, high, color=color, alpha=0.2, linewidth=0)
-    axis.plot(line.x, middle, color=color, linestyle=style, linewidth=1.4, label=line.label, **dot)
-
-
-def _dress(axis) -> None:
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.grid(alpha=0.25)
 
 
 def learning_curve(path: Path, metrics: Mapping[str, np.ndarray], title: str) -> None:
@@ -134,26 +107,17 @@ def learning_curve(path: Path, metrics: Mapping[str, np.ndarray], title: str) ->
     axes = np.atleast_1d(np.asarray(figure.subplots(len(teams), sharex=True), dtype=object))
     seeds = np.unique(metrics["seed"])
     who = f"mean of {len(seeds)} seeds, 95 % interval" if len(seeds) > 1 else "one seed"
-    for axis, team, color in zip(axes, teams, ("tab:blue", "tab:red"), strict=False):
+    for axis, team in zip(axes, teams, strict=True):
+        color = style.web(style.TEAM.get(team.removeprefix("return_"), style.BLUE))
         evaluated = f"eval_{team}" in metrics
-        kinds = [(team, "training (exploring)", "tab:gray" if evaluated else color)]
+        kinds = [(team, "training (exploring)", style.web(style.GREY) if evaluated else color)]
         kinds += [(f"eval_{team}", "evaluation (deterministic)", color)] if evaluated else []
         for name, kind, shade in kinds:
             steps, curves = by_seed(metrics, name)
-            curve(axis, steps, curves, shade, f"{kind}, {who}", each=True)
+            style.band(axis, steps, t_interval(curves), shade, f"{kind}, {who}", seeds=curves)
+        style.dress(axis)
         axis.set_ylabel(f"return\n{team.removeprefix('return_')}")
         axis.legend(loc="lower right", frameon=False)
     axes[-1].set_xlabel("env steps of each seed")
     axes[0].set_title(title)
     figure.savefig(path, dpi=120)
-
-
-def curve(axis, steps: np.ndarray, curves: np.ndarray, color: str, label: str, each: bool = False) -> None:
-    """One line: the mean of curves [seeds, points] with the 95 % interval of the mean; `each`: every seed too, thin."""
-    mean, half = mean_interval(curves)
-    if each and len(curves) > 1:
-        axis.plot(steps, curves.T, color=color, linewidth=0.5, alpha=0.35)
-    if len(curves) > 1:
-        axis.fill_between(steps, mean - half, mean + half, color=color, alpha=0.25, linewidth=0)
-    axis.plot(steps, mean, color=color, label=label if len(curves) > 1 else "one seed")
-    _dress(axis)

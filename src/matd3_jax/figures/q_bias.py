@@ -1,4 +1,4 @@
-"""The critics' estimates beside true values, and how far they overestimate."""
+"""The critics' estimates and true values, and how far they overestimate."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -7,10 +7,10 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from matd3_jax.figures.learning_curves import curve
-from matd3_jax.figures.palette import AGENT, BLACK, Color
+from matd3_jax.figures import style
 from matd3_jax.runs.metrics import by_seed
 from matd3_jax.runs.overestimation import team_values
+from matd3_jax.stats.intervals import t_interval
 
 
 def draw(path: Path, metrics: Mapping[str, np.ndarray], teams: Mapping[str, Sequence[str]], title: str) -> None:
@@ -29,13 +29,13 @@ def draw(path: Path, metrics: Mapping[str, np.ndarray], teams: Mapping[str, Sequ
     for (values, bias), (team, agents) in zip(axes.T, teams.items(), strict=True):
         steps, truth = team_values(metrics, agents, "q_true")
         estimate, over = (team_values(metrics, agents, name)[1] for name in ("q_estimate", "overestimation"))
-        _line(values, steps, estimate, AGENT[0], "estimate of the critics")
-        _line(values, steps, truth, AGENT[1], "true value of the policies", dashed=True)
+        _line(values, steps, estimate, style.BLUE, "estimate of the critics")
+        _line(values, steps, truth, style.VERMILION, "true value of the policies", "dashed")
         for k, agent in enumerate(agents if len(agents) > 1 else ()):
             each = by_seed(metrics, f"{agent}_overestimation")[1].mean(axis=0)
-            color = _hex(AGENT[(k + 2) % len(AGENT)])
+            color = style.SERIES[(k + 2) % len(style.SERIES)]
             bias.plot(steps, each, color=color, linewidth=1, label=agent, zorder=3)
-        _line(bias, steps, over, BLACK, f"mean of the {len(agents)} agents" if len(agents) > 1 else agents[0])
+        _line(bias, steps, over, style.BLACK, f"mean of the {len(agents)} agents" if len(agents) > 1 else agents[0])
         bias.axhline(0, color="gray", linewidth=0.8)
         values.set_title(team if len(teams) > 1 else "")
         values.set_ylabel("discounted return" + (f", mean of {len(agents)} agents" if len(agents) > 1 else ""))
@@ -47,13 +47,6 @@ def draw(path: Path, metrics: Mapping[str, np.ndarray], teams: Mapping[str, Sequ
     figure.savefig(path, dpi=120)
 
 
-def _line(axis, steps: np.ndarray, curves: np.ndarray, color: Color, label: str, dashed: bool = False) -> None:
-    curve(axis, steps, curves, _hex(color), label)
-    line = axis.lines[-1]
-    line.set(label=label, linewidth=1.8, linestyle="--" if dashed else "-")
-    if len(steps) == 1:
-        line.set_marker("o")
-
-
-def _hex(color: Color) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*color)
+def _line(axis, steps: np.ndarray, curves: np.ndarray, color: style.Color, label: str, dashes: str = "solid") -> None:
+    style.band(axis, steps, t_interval(curves), style.web(color), label, dashes, width=1.8)
+    style.dress(axis)

@@ -1,4 +1,4 @@
-"""A sweep in one picture: the curves of its settings, and what came of each value of each swept key."""
+"""A sweep in one picture: the curves of its settings, and the final values over each swept key."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -7,13 +7,14 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from matd3_jax.figures import style
 from matd3_jax.runs.directory import together
 from matd3_jax.runs.metrics import by_seed
-from matd3_jax.stats.intervals import mean_interval
+from matd3_jax.stats.intervals import t_interval
 from matd3_jax.sweep.ranking import Ranked
 
-BEST = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
-"""Okabe and Ito's, told apart by the color-blind; for the best settings, in order."""
+BEST = style.SERIES[:5]
+"""Of the best settings, in order."""
 
 
 def draw(path: Path, folder: Path, runs: Mapping[str, Sequence[str]], rows: Sequence[Ranked], metric: str) -> None:
@@ -47,10 +48,7 @@ def _curves(axis, folder: Path, runs: Mapping[str, Sequence[str]], rows: Sequenc
             label = "others" if k == len(BEST) else None
             axis.plot(steps, means[-1], color="0.75", linewidth=0.8, label=label)
             continue
-        mean, half = mean_interval(curves)
-        if len(curves) > 1:
-            axis.fill_between(steps, mean - half, mean + half, color=BEST[k], alpha=0.2, linewidth=0)
-        axis.plot(steps, mean, color=BEST[k], label=f"{k + 1}: {row.name}")
+        style.band(axis, steps, t_interval(curves), BEST[k], f"{k + 1}: {row.name}")
     handles, labels = axis.get_legend_handles_labels()
     axis.legend(handles[::-1], labels[::-1], frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
     axis.set_xlabel("env steps of each seed")
@@ -62,7 +60,7 @@ def _curves(axis, folder: Path, runs: Mapping[str, Sequence[str]], rows: Sequenc
     if finite.size:  # not where everything diverged
         room = 0.1 * (np.ptp(finite) or 1.0)
         axis.set_ylim(finite.min() - room, finite.max() + room)
-    _clean(axis)
+    style.dress(axis)
 
 
 def _values(axis, key: str, rows: Sequence[Ranked], metric: str) -> None:
@@ -75,22 +73,17 @@ def _values(axis, key: str, rows: Sequence[Ranked], metric: str) -> None:
         numbers = None
     listed = sorted(set(texts), key=float) if numbers is not None else sorted(set(texts))
     if len(listed) > 8 and numbers is not None:  # drawn from an interval
-        places = numbers
+        at = numbers
         if (numbers > 0).all() and numbers.max() > 10 * numbers.min():
             axis.set_xscale("log")
     else:
-        places = np.array([listed.index(text) for text in texts], float)
+        at = np.array([listed.index(text) for text in texts], float)
         axis.set_xticks(range(len(listed)), listed, rotation=30 if max(map(len, listed)) > 8 else 0)
         for k in range(len(listed)):
-            axis.hlines(np.median(finals[places == k]), k - 0.25, k + 0.25, color="black", linewidth=1.2)
+            axis.hlines(np.median(finals[at == k]), k - 0.25, k + 0.25, color="black", linewidth=1.2)
         axis.margins(x=0.15)
-    axis.scatter(places, finals, s=14, color="0.5", alpha=0.7, linewidth=0)
-    axis.scatter(places[:1], finals[:1], s=28, color=BEST[0], zorder=3)  # the best setting
+    axis.scatter(at, finals, s=14, color="0.5", alpha=0.7, linewidth=0)
+    axis.scatter(at[:1], finals[:1], s=28, color=BEST[0], zorder=3)  # the best setting
     axis.set_xlabel(key)
     axis.set_ylabel(f"final {metric}", fontsize=8)
-    _clean(axis)
-
-
-def _clean(axis) -> None:
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.grid(alpha=0.25)
+    style.dress(axis)

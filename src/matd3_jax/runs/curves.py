@@ -46,7 +46,7 @@ def of_table(metrics: Mapping[str, np.ndarray], name: str, over: str = "step", w
     Args:
         metrics: columns [rows], each seed's rows ascending; as `directory.together` gives them.
         over: one of `AXES`.
-        window: take the mean of the last so many episodes at each point (of all, as long as they are fewer), each row
+        window: take the mean of the last `window` episodes at each point (of all, as long as they are fewer), each row
             counting with the episodes that ended in it.
 
     Raises:

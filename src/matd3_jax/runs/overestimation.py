@@ -10,6 +10,7 @@ from matd3_jax.core.q_bias import Values
 from matd3_jax.runs.metrics import by_seed
 from matd3_jax.runs.summary import final
 from matd3_jax.stats.intervals import mean_interval
+from matd3_jax.stats.text import plus_minus
 
 COLUMNS = ("q_estimate", "q_true", "q_true_interval", "overestimation", "overestimation_interval")
 """Of each agent, in the metrics table as AGENT_COLUMN."""
@@ -37,7 +38,7 @@ def columns(agents: Sequence[str], found: Values | None, seeds: int) -> dict[str
 
 
 def tail_note(hyper: Sequence[HyperParams], steps: int) -> str | None:
-    """One line where rollouts of `steps` end too early to stand beside the critics' infinite horizon; else None."""
+    """One line where rollouts of `steps` end too early to be compared with the critics' infinite horizon; else None."""
     gamma = max(float(np.max(h.gamma)) for h in hyper)
     if gamma**steps <= TOLERATED_TAIL:
         return None
@@ -78,7 +79,8 @@ def lines(metrics: Mapping[str, np.ndarray], agents: Sequence[str], rollouts: in
         (estimate, _), (truth, _), (mean, half) = (finals[n] for n in ("q_estimate", "q_true", "overestimation"))
         if half is None:
             half = by_seed(metrics, f"{agent}_overestimation_interval")[1][0, -1] if rollouts > 1 else math.nan
-        found.append(f"  {agent}: estimate {estimate:.4g}, truth {truth:.4g}, overestimation {mean:.4g} ± {half:.2g}")
+        over = plus_minus(mean, half)
+        found.append(f"  {agent}: estimate {estimate:.4g}, truth {truth:.4g}, overestimation {over}")
     return found
 
 

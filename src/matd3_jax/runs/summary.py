@@ -1,10 +1,11 @@
-"""What a run came to: the last tenth of it, over its seeds."""
+"""The summary of a run: the last tenth of it, over its seeds."""
 
 from typing import Any
 
 import numpy as np
 
 from matd3_jax.stats.intervals import mean_interval
+from matd3_jax.stats.text import plus_minus
 
 
 def finals(metrics: dict[str, np.ndarray]) -> dict[str, tuple[float, float | None]]:
@@ -39,5 +40,5 @@ def final(values: np.ndarray) -> tuple[float, float | None]:
 
 
 def text(final: tuple[float, float | None], over: str) -> str:
-    mean, half = final
-    return f"{mean:.4g}" if half is None else f"{mean:.4g} ± {half:.2g} {over}"
+    """Write a mean with its half width, and what that is `over`."""
+    return plus_minus(*final) + ("" if final[1] is None else f" {over}")

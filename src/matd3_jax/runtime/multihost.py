@@ -1,5 +1,5 @@
-"""Several processes, on one host or several, that train one run: who they are, whose seeds are whose, what they tell
-each other.
+"""Several processes, on one host or several, that train one run: who they are, whose seeds are whose, and their
+messages.
 
 Seeds are independent, so each process trains its own with the ordinary program on its own devices. Every interval the
 others send the first their rows of the metrics table, and all agree whether to stop: nothing else is communicated.
@@ -17,9 +17,9 @@ from typing import Any, NamedTuple, Self
 
 import jax
 import numpy as np
-from jax._src.distributed import State  # JAX's coordination service has no public key-value store
 
 from matd3_jax.errors import UserError
+from matd3_jax.private import coordination_service
 from matd3_jax.runtime import devices, slurm
 
 
@@ -47,17 +47,17 @@ class Processes:
     Args:
         index: which of them this is, from 0.
         client: of the coordination service.
-        here: how many of them run on this machine.
+        local: how many of them run on this machine.
         name: before the keys of their messages.
     """
 
-    def __init__(self, index: int = 0, size: int = 1, client: Any = None, here: int = 1, name: str = "matd3_jax"):
-        self.index, self.size, self.here = index, size, here
+    def __init__(self, index: int = 0, size: int = 1, client: Any = None, local: int = 1, name: str = "matd3_jax"):
+        self.index, self.size, self.local = index, size, local
         self.first = index == 0
-        """The first process alone writes files (but for its part of checkpoints) and tells of the run."""
+        """The first process alone writes files (but for its part of checkpoints) and prints."""
         self._client, self._name = client, name
         self._calls = 0
-        self._told: list[str] = []
+        self._sent: list[str] = []
 
     def share(self, seeds: int) -> Share:
         """This process's part of `seeds`: neighbors, shares differ by one at most. Raises UserError where some process
@@ -76,11 +76,11 @@ class Processes:
         self._calls += 1
         if self.index >= size:
             return None
-        return Processes(self.index, min(size, self.size), self._client, self.here, self._key("part"))
+        return Processes(self.index, min(size, self.size), self._client, self.local, self._key("part"))
 
     # ---- messages ----------------------------------------------------------------------------------------------------
 
-    def collect(self, message: bytes) -> list[bytes]:
+    def gather_messages(self, message: bytes) -> list[bytes]:
         """All messages, in the order of the processes, to the first of them; nothing to the others."""
         self._calls += 1
         if not self.first:
@@ -91,39 +91,39 @@ class Processes:
             key = self._key(index)
             found.append(self._receive(key))
             self._client.key_value_delete(key)
-        # Whoever has sent this message has read all that it was told before.
-        for key in self._told:
+        # Whoever has sent this message has received everything broadcast before it.
+        for key in self._sent:
             self._client.key_value_delete(key)
-        self._told.clear()
+        self._sent.clear()
         return found
 
-    def tell(self, value: Any = None) -> Any:
-        """What the first process gives (plain values, as JSON has them), to all."""
+    def broadcast(self, value: Any = None) -> Any:
+        """Send what the first process gives (plain values, as JSON has them) to all."""
         self._calls += 1
         if self.size == 1:
             return value
-        key = self._key("told")
+        key = self._key("broadcast")
         if not self.first:
             return json.loads(self._receive(key))
         self._client.key_value_set_bytes(key, json.dumps(value).encode())
-        self._told.append(key)
+        self._sent.append(key)
         return value
 
     def barrier(self) -> None:
-        """Wait until all have come here."""
-        self.collect(b"here")
-        self.tell()
+        """Wait until all processes call this."""
+        self.gather_messages(b"barrier")
+        self.broadcast()
 
     def agree(self, number: int) -> int:
         """The largest of what the processes give, to all."""
-        return self.tell(max((int(m) for m in self.collect(str(number).encode())), default=None))
+        return self.broadcast(max((int(m) for m in self.gather_messages(str(number).encode())), default=None))
 
     def gather(self, row: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Columns [seeds of the process] of numbers, the same ones in all, as columns [seeds of all] in the first
         process; the others keep their own."""
         if self.size == 1:
             return row
-        parts = self.collect(np.stack([column.astype(np.float64) for column in row.values()]).tobytes())
+        parts = self.gather_messages(np.stack([column.astype(np.float64) for column in row.values()]).tobytes())
         if not parts:
             return row
         whole = np.concatenate([np.frombuffer(part).reshape(len(row), -1) for part in parts], axis=1)
@@ -131,11 +131,11 @@ class Processes:
 
     def check_same(self, text: str, what: str) -> None:
         """Raise UserError unless all give the same text. what: names it in the message."""
-        texts = self.collect(text.encode())
+        texts = self.gather_messages(text.encode())
         for index, other in enumerate(texts):
             if other != texts[0]:
                 raise UserError(f"process {index} was given {what} other than process 0: {other.decode()}")
-        self.tell()
+        self.broadcast()
 
     def _receive(self, key: str) -> bytes:
         """The value of a key as soon as it is there. Raises Left where another process has ended."""
@@ -151,14 +151,14 @@ class Processes:
     def description(self) -> dict[str, Any]:
         """The machine and devices; of several processes in the first, which has those of each under "processes"."""
         mine = devices.description()
-        each = [json.loads(text) for text in self.collect(json.dumps(mine).encode())]
+        each = [json.loads(text) for text in self.gather_messages(json.dumps(mine).encode())]
         return {**mine, "processes": each} if len(each) > 1 else mine
 
     def same_directory(self, path: Path) -> Path:
         """The directory that the first process has made, in all. Raises UserError where another does not see it."""
         if self.size == 1:
             return path
-        found, deadline = Path(self.tell(str(path.resolve()))), time.monotonic() + 30
+        found, deadline = Path(self.broadcast(str(path.resolve()))), time.monotonic() + 30
         while not found.is_dir():
             if time.monotonic() > deadline:  # a network file system may take a while to show it
                 raise UserError(
@@ -188,8 +188,9 @@ class Processes:
             self._client.key_value_set(f"{LEFT}/{self.index}", text)
 
 
-ALONE = Processes()
+SINGLE_PROCESS = Processes()
 """One process, which does everything by itself."""
+
 
 END_SECONDS = 60
 """How long a process that ends before its time waits for the others to notice, before they are made to."""
@@ -210,21 +211,21 @@ def start(given: Mapping[str, str]) -> Processes:
     """
     found = slurm.detect(given, os.environ)
     if found is None or found.num_processes == 1:
-        return ALONE
+        return SINGLE_PROCESS
     address, size, index, _ = found
     # It would catch SIGTERM, which the commands do themselves.
     jax.config.update("jax_enable_preemption_service", False)
     print(f"process {index}: waiting for all {size} processes at {address}", flush=True)
     slurm.look_for(address, index == 0)
-    # What `jax.distributed.initialize` does, but for telling JAX's backends, which would join all processes' devices:
+    # What `jax.distributed.initialize` does, but for informing JAX's backends, which would join all processes' devices:
     # Orbax would then write arrays in process 0 only, and the compilation cache be written by that one alone.
-    service = State()
+    service = coordination_service()()
     service.initialize(
         *found, cluster_detection_method="deactivate", initialization_timeout=slurm.START_SECONDS,
         shutdown_timeout_seconds=END_SECONDS,
     )  # fmt: skip
     atexit.register(service.shutdown)
     processes = Processes(index, size, service.client)
-    names = processes.tell([name.decode() for name in processes.collect(socket.gethostname().encode())])
-    processes.here = names.count(names[index])
+    names = processes.broadcast([name.decode() for name in processes.gather_messages(socket.gethostname().encode())])
+    processes.local = names.count(names[index])
     return processes

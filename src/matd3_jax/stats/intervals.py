@@ -94,12 +94,6 @@ def compare(a: np.ndarray, b: np.ndarray, paired: bool = False, confidence: floa
     return Comparison(difference, low, high, p, len(a), len(b))
 
 
-def welch_interval(a: np.ndarray, b: np.ndarray) -> float:
-    """Half width of the 95 % confidence interval of the difference of the means of a [n] and b [m] (Welch)."""
-    found = compare(a, b)
-    return float(found.high - found.low) / 2
-
-
 def samples(values: np.ndarray, axis: int, confidence: float = 0.95) -> np.ndarray:
     """float64 values with the seeds in front. Raises ValueError for what no interval can be had of."""
     values = np.asarray(values, dtype=float)

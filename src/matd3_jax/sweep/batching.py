@@ -1,4 +1,4 @@
-"""Settings into runs, and runs into pieces: what is trained side by side in one program and fits the memory."""
+"""Settings into runs, and runs into batches: what is trained together in one program and fits the memory."""
 
 import dataclasses
 import json
@@ -14,8 +14,8 @@ from matd3_jax.errors import UserError
 
 
 def program(config: Config) -> str:
-    """A text that is the same for all settings whose runs can share one program: all but hyper-parameters, seeds and
-    places."""
+    """A text that is the same for all settings whose runs can share one program: all but hyper-parameters, seeds, and
+    where and how often files are written."""
 
     def shape(team: AlgoConfig) -> AlgoConfig:
         free: dict[str, Any] = dict.fromkeys(HYPER_PARAMS, 0.0)
@@ -53,7 +53,7 @@ def missing(config: Config, existing: Mapping[str, Config]) -> tuple[list[str], 
     return names, [seed for seed in wanted if seed not in there]
 
 
-def stretches(seeds: Sequence[int], longest: int) -> list[tuple[int, int]]:
+def consecutive(seeds: Sequence[int], longest: int) -> list[tuple[int, int]]:
     """(first seed, number of seeds) of runs of consecutive seeds, of nearly equal length and none above `longest`."""
     found: list[tuple[int, int]] = []
     for seed in seeds:
@@ -69,10 +69,10 @@ def stretches(seeds: Sequence[int], longest: int) -> list[tuple[int, int]]:
     return cut
 
 
-def pieces(
+def batches(
     settings: Mapping[str, Config], existing: Mapping[str, Config], folder: Path, fitting: Callable[[Config], int]
 ) -> list[list[Config]]:
-    """Runs yet to be trained, grouped into pieces: each a program of its own, that fits the memory.
+    """Runs yet to be trained, grouped into batches: each a program of its own, that fits the memory.
 
     A setting whose seeds do not fit at once becomes several runs; otherwise it stays whole.
 
@@ -91,16 +91,16 @@ def pieces(
         key = program(config)
         if key not in most:
             most[key] = fitting(config)
-        cut = stretches(seeds, most[key])
+        cut = consecutive(seeds, most[key])
         for first, number in cut:
             label = name if not found and len(cut) == 1 else f"{name}-seeds_{first}_to_{first + number - 1}"
             run = dataclasses.replace(config, seed=first, seeds=number, name=label, out=str(folder))
             by_program.setdefault(key, []).append(run)
-    return [piece for key, runs in by_program.items() for piece in packed(runs, most[key])]
+    return [batch for key, runs in by_program.items() for batch in packed(runs, most[key])]
 
 
 def packed(runs: Sequence[Config], most: int) -> list[list[Config]]:
-    """Runs in order, whole, in as few pieces as hold at most `most` seeds each, evenly filled."""
+    """Runs in order, whole, in as few batches as hold at most `most` seeds each, evenly filled."""
 
     def filled(limit: int) -> list[list[Config]]:
         found: list[list[Config]] = []

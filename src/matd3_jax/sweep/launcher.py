@@ -1,6 +1,6 @@
-"""Pieces of a sweep as jobs of a Hydra launcher: on a SLURM cluster, in local processes, one after another.
+"""Batches of a sweep as jobs of a Hydra launcher: on a SLURM cluster, in local processes, one after another.
 
-`python -m matd3_jax.sweep.launcher --multirun sweep=SWEEP_DIR piece=0,1,2 hydra/launcher=submitit_slurm` is what
+`python -m matd3_jax.sweep.launcher --multirun sweep=SWEEP_DIR batch=0,1,2 hydra/launcher=submitit_slurm` is what
 `launch` runs.
 """
 
@@ -22,10 +22,10 @@ from matd3_jax.errors import UserError, nearest
 
 @dataclasses.dataclass
 class Job:
-    """One piece of a sweep."""
+    """One batch of a sweep."""
 
     sweep: str = MISSING
-    piece: int = MISSING
+    batch: int = MISSING
 
 
 ConfigStore.instance().store(name="matd3_jax_job", node=Job)
@@ -47,16 +47,16 @@ def check(launcher: str, options: Sequence[str]) -> None:
             raise UserError(f"the launcher {launcher} has no option {key!r}; {nearest(key, map(str, keys))}")
 
 
-def launch(folder: Path, pieces: int, launcher: str, options: Sequence[str]) -> int:
-    """Train the pieces of the sweep in `folder` as jobs and wait for them: the exit code.
+def launch(folder: Path, batches: int, launcher: str, options: Sequence[str]) -> int:
+    """Train the batches of the sweep in `folder` as jobs and wait for them: the exit code.
 
     Args:
         options: "launcher.KEY=value", the launcher's own.
     """
     folder = folder.resolve()
     command = [sys.executable, "-m", "matd3_jax.sweep.launcher", "--multirun", f"sweep={_quoted(folder)}"]
-    command += [f"piece={','.join(map(str, range(pieces)))}", f"hydra/launcher={launcher}"]
-    command += [f"hydra.sweep.dir={_quoted(folder / 'jobs')}", "hydra.sweep.subdir=${piece}"]
+    command += [f"batch={','.join(map(str, range(batches)))}", f"hydra/launcher={launcher}"]
+    command += [f"hydra.sweep.dir={_quoted(folder / 'jobs')}", "hydra.sweep.subdir=${batch}"]
     command += [f"hydra.{option}" for option in options]
     return subprocess.run(command).returncode
 
@@ -70,8 +70,8 @@ def _quoted(path: Path) -> str:
 
 @hydra.main(version_base=None, config_path=None, config_name="matd3_jax_job")
 def job(config: Job) -> int:
-    """Train one piece: `python -m matd3_jax.sweep` in this process."""
-    sys.argv = ["matd3_jax.sweep", f"resume={config.sweep}", f"piece={config.piece}"]
+    """Train one batch: `python -m matd3_jax.sweep` in this process."""
+    sys.argv = ["matd3_jax.sweep", f"resume={config.sweep}", f"batch={config.batch}"]
     try:
         runpy.run_module("matd3_jax.sweep", run_name="__main__", alter_sys=True)
     except SystemExit as end:

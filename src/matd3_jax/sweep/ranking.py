@@ -1,4 +1,4 @@
-"""The settings of a sweep in the order of what they came to."""
+"""The settings of a sweep, ranked by their final returns."""
 
 import csv
 import dataclasses
@@ -12,11 +12,12 @@ from rich.table import Table
 from matd3_jax.errors import UserError, nearest
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.stats.intervals import mean_interval
+from matd3_jax.stats.text import plus_minus
 
 
 @dataclasses.dataclass(frozen=True)
 class Ranked:
-    """What one setting came to; arrays [seeds]."""
+    """The summary of one setting; arrays [seeds]."""
 
     name: str
     values: Mapping[str, str]
@@ -78,7 +79,7 @@ def show(rows: Sequence[Ranked], title: str, most: int = 30) -> None:
     for heading in ("rank", *rows[0].values, "seeds", "diverged", "final", "area under the curve"):
         table.add_column(heading, justify="right")
     for k, row in enumerate(rows[:most]):
-        cells = [_interval(row.interval(which)) for which in ("final", "area")]
+        cells = [plus_minus(*row.interval(which)) for which in ("final", "area")]
         diverged = str(row.diverged.sum()) if row.diverged.any() else "-"
         table.add_row(str(k + 1), *row.values.values(), str(len(row.seeds)), diverged, *cells)
     Console(width=None if Console().is_terminal else 200).print(table)
@@ -108,8 +109,3 @@ def write(folder: Path, rows: Sequence[Ranked]) -> None:
 def _mean(values: np.ndarray) -> float:
     there = values[~np.isnan(values)]  # no episode need have ended in an interval
     return float(there.mean()) if there.size else np.nan
-
-
-def _interval(found: tuple[float, float]) -> str:
-    mean, half = found
-    return f"{mean:.4g}" + (f" ± {half:.2g}" if np.isfinite(half) else "")

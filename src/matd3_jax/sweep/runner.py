@@ -1,7 +1,7 @@
-"""Train many settings: runs that can share a program side by side in it, piece after piece.
+"""Train many settings: runs that can share a program as one batch, batch after batch.
 
-A folder holds `runs/NAME/`, an ordinary run directory for each run, `pieces.json` (which runs are trained together)
-and, while a piece is at work, `pieces/K/` with its checkpoints. Each piece can be trained by a process of its own.
+A folder holds `runs/NAME/`, an ordinary run directory for each run, `batches.json` (which runs are trained together)
+and, while a batch is trained, `batches/K/` with its checkpoints. Each batch can be trained by a process of its own.
 """
 
 import contextlib
@@ -19,34 +19,36 @@ from matd3_jax.config import Config
 from matd3_jax.errors import UserError
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import devices, files
-from matd3_jax.runtime.multihost import ALONE, Processes
+from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.sweep import batching
 from matd3_jax.training import checkpoint, finish
 from matd3_jax.training import run as training_run
 from matd3_jax.training.loggers import Logger, TableLogger, TensorBoardLogger
-from matd3_jax.training.loop import TrainState
 from matd3_jax.training.memory import fitting_seeds, needed
 from matd3_jax.training.progress import ProgressBar
 from matd3_jax.training.session import Row, TrainingSession
+from matd3_jax.training.state import TrainState
 
 
 class Sweep:
-    """The runs of a folder and their pieces.
+    """The runs of a folder and their batches.
 
     Args:
-        processes: which train every piece together, its seeds shared out among them (among as many as there are
+        processes: which train every batch together, its seeds shared out among them (among as many as there are
             seeds); the first of them plans, and writes all but the others' part of checkpoints.
     """
 
-    def __init__(self, folder: Path, processes: Processes = ALONE):
+    def __init__(self, folder: Path, processes: Processes = SINGLE_PROCESS):
         self.folder, self.processes = folder, processes
         self.runs = folder / "runs"
-        self._plan = folder / "pieces.json"
+        # Older sweeps called their batches pieces.
+        self._name = "pieces" if (folder / "pieces.json").exists() else "batches"
+        self._plan = folder / f"{self._name}.json"
 
     @property
-    def pieces(self) -> list[list[str]]:
-        """Names of the runs in each piece."""
+    def batches(self) -> list[list[str]]:
+        """Names of the runs in each batch."""
         return json.loads(self._plan.read_text()) if self._plan.exists() else []
 
     def add(self, settings: Mapping[str, Config], budget: int | None = None) -> dict[str, list[Path]]:
@@ -54,80 +56,84 @@ class Sweep:
         among them.
 
         Args:
-            budget: bytes that a piece may take in each process; None: what is free now.
+            budget: bytes that a batch may take in each process; None: what is free now.
 
         Raises UserError where a setting is impossible, or one seed of it does not fit.
         """
         if any(config.tensorboard for config in settings.values()):
             TensorBoardLogger.check()
-        budget = devices.free_memory(self.processes.here) if budget is None else budget
+        budget = devices.free_memory(self.processes.local) if budget is None else budget
         size = self.processes.size
         existing = batching.existing_runs(self.runs)
-        new = batching.pieces(settings, existing, self.runs, lambda config: size * fitting_seeds(config, budget))
+        new = batching.batches(settings, existing, self.runs, lambda config: size * fitting_seeds(config, budget))
         machine = {"versions": devices.versions(), **devices.description()}
-        for config in (config for piece in new for config in piece):
+        for config in (config for batch in new for config in batch):
             RunDirectory.create(self.runs / str(config.name), config, machine)
         if new:
-            whole = [*self.pieces, *([str(config.name) for config in piece] for piece in new)]
+            whole = [*self.batches, *([str(config.name) for config in batch] for batch in new)]
             files.write_json(self._plan, whole)
         existing = batching.existing_runs(self.runs)
         return {name: [self.runs / run for run in batching.missing(c, existing)[0]] for name, c in settings.items()}
 
-    def finished(self, piece: int) -> bool:
-        """Whether all runs of a piece are."""
-        return all(RunDirectory(self.runs / name).summary() is not None for name in self.pieces[piece])
+    def folder_of(self, batch: int) -> Path:
+        """Where a batch has its lock and its checkpoints while it is trained."""
+        return self.folder / self._name / str(batch)
+
+    def finished(self, batch: int) -> bool:
+        """Whether all runs of a batch are."""
+        return all(RunDirectory(self.runs / name).summary() is not None for name in self.batches[batch])
 
     def train(self, only: Collection[int] | None = None) -> int:
-        """Train the unfinished pieces, or those of `only`: the exit code, 0 or 128 + the signal that ended it.
+        """Train the unfinished batches, or those of `only`: the exit code, 0 or 128 + the signal that ended it.
 
-        Pieces at which another process works are passed over.
+        Batches that another process trains are skipped.
         """
         stop = Stop()
-        todo = [k for k in range(len(self.pieces)) if not self.finished(k) and (only is None or k in only)]
-        for k in self.processes.tell(todo):
+        todo = [k for k in range(len(self.batches)) if not self.finished(k) and (only is None or k in only)]
+        for k in self.processes.broadcast(todo):
             with self._taken(k) as mine:
-                if self.processes.tell(mine and not self.finished(k)):
+                if self.processes.broadcast(mine and not self.finished(k)):
                     together = self.processes.part(sum(member.seeds for member in self.members(k)))
                     if together is not None:
-                        Piece(self, k, together).train(stop)
+                        Batch(self, k, together).train(stop)
                 stopped = stop.agreed(self.processes)
             if stopped is not None:
                 return 128 + stopped
         return 0
 
-    def members(self, piece: int) -> list[Config]:
-        """Settings of the runs in a piece."""
-        return [RunDirectory.open(self.runs / name)[1] for name in self.pieces[piece]]
+    def members(self, batch: int) -> list[Config]:
+        """Settings of the runs in a batch."""
+        return [RunDirectory.open(self.runs / name)[1] for name in self.batches[batch]]
 
     @contextlib.contextmanager
-    def _taken(self, piece: int) -> Iterator[bool]:
-        """Whether these processes have the piece to themselves now; the first takes it for all."""
+    def _taken(self, batch: int) -> Iterator[bool]:
+        """Whether these processes have the batch to themselves now; the first takes it for all."""
         if not self.processes.first:
             yield False
             return
-        place = self.folder / "pieces" / str(piece)
-        place.mkdir(parents=True, exist_ok=True)
-        with (place / "lock").open("w") as lock:
+        folder = self.folder_of(batch)
+        folder.mkdir(parents=True, exist_ok=True)
+        with (folder / "lock").open("w") as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
-                print(f"piece {piece}: another process is at it, passed over", flush=True)
+                print(f"batch {batch}: another process trains it, skipped", flush=True)
                 yield False
                 return
             yield True
-        if self.finished(piece):
-            shutil.rmtree(place, ignore_errors=True)
+        if self.finished(batch):
+            shutil.rmtree(folder, ignore_errors=True)
 
 
-class Piece:
-    """Runs side by side in one program, in one process or several."""
+class Batch:
+    """Runs that share one program, in one process or several."""
 
-    def __init__(self, sweep: Sweep, number: int, processes: Processes = ALONE):
+    def __init__(self, sweep: Sweep, number: int, processes: Processes = SINGLE_PROCESS):
         self.sweep, self.number, self.processes = sweep, number, processes
-        self.runs = [RunDirectory(sweep.runs / name) for name in sweep.pieces[number]]
+        self.runs = [RunDirectory(sweep.runs / name) for name in sweep.batches[number]]
         self.members = sweep.members(number)
         self.training = TrainingSession(self.members[0], members=self.members, processes=processes)
-        self.checkpoints = sweep.folder / "pieces" / str(number) / "checkpoints"
+        self.checkpoints = sweep.folder_of(number) / "checkpoints"
         ends = np.cumsum([config.seeds for config in self.members])
         self.seeds = [slice(end - config.seeds, end) for end, config in zip(ends.tolist(), self.members, strict=True)]
         """Where each run's seeds are."""
@@ -158,21 +164,21 @@ class Piece:
         self._finish(outcome.state, outcome.row, {"seconds": round(time.monotonic() - begun, 1), **rates})
 
     def _begin(self) -> tuple[TrainState, Row]:
-        first, tell = self.processes.first, self.processes.tell
-        if not tell(bool(checkpoint.steps(self.checkpoints)) if first else None):
+        first, broadcast = self.processes.first, self.processes.broadcast
+        if not broadcast(bool(checkpoint.steps(self.checkpoints)) if first else None):
             for run in self.runs if first else ():
                 run.clear()
             state, row = self.training.start()
             if first:
                 self.table.log(row)
             return state, row
-        saved = Path(tell(str(checkpoint.verify(self.checkpoints)) if first else None))
+        saved = Path(broadcast(str(checkpoint.verify(self.checkpoints)) if first else None))
         state, done = checkpoint.restore(saved, self.training.trainer, self.training.share), int(saved.name)
         self.processes.barrier()
         for run in self.runs if first else ():
             run.cut(done)
         if first:
-            print(f"going on from the checkpoint of env step {done:,}", flush=True)
+            print(f"resuming from the checkpoint of env step {done:,}", flush=True)
         updates = self.training.trainer.updates(int(state.rollouts))
         return state, {"step": np.array([done]), "updates": np.array([updates])}
 
@@ -192,7 +198,7 @@ class Piece:
         several = f" in each of {size} processes" if size > 1 else ""
         names = [str(member.name) for member in self.members]
         shown = ", ".join(names if len(names) <= 4 else [*names[:2], "...", names[-1]])
-        print(f"piece {self.number} ({self.number + 1} of {len(self.sweep.pieces)}): {len(names)} runs, {seeds} seeds "
+        print(f"batch {self.number} ({self.number + 1} of {len(self.sweep.batches)}): {len(names)} runs, {seeds} seeds "
               f"in all, on {mesh.size} x {mesh.devices.flat[0].device_kind}{several}: {shown}")  # fmt: skip
         print(f"{config.env['name']}, {training.total_steps:,} env steps each; {training.memory}; "
               f"{needed(training.trainer, len(training.seeds)) / 1e9:.2f} GB in all", flush=True)  # fmt: skip
@@ -208,17 +214,17 @@ class Stopped(Exception):
 def train(settings: Mapping[str, Config], folder: Path, budget: int | None = None) -> dict[str, list[Path]]:
     """Train what is missing of `settings` (by name) in `folder`: the directories of each setting's finished runs.
 
-    The same call goes on where it was stopped, and finished runs are used as they are. `budget`: as for `Sweep.add`.
+    The same call resumes where it was stopped, and finished runs are used as they are. `budget`: as for `Sweep.add`.
     Raises UserError, and Stopped when a signal ended the training.
     """
     sweep = Sweep(folder)
     runs = sweep.add(settings, budget)
     wanted = [path for paths in runs.values() for path in paths]
     names = {path.name for path in wanted}
-    code = sweep.train([k for k, piece in enumerate(sweep.pieces) if names & set(piece)])
+    code = sweep.train([k for k, batch in enumerate(sweep.batches) if names & set(batch)])
     if code:
         raise Stopped(code)
     for path in wanted:
         if RunDirectory(path).summary() is None:
-            raise UserError(f"{path} is not finished, and not here to be: another process is at it, or none knows it")
+            raise UserError(f"{path} is not finished: another process trains it, or the sweep's plan does not have it")
     return runs

@@ -26,16 +26,17 @@ import orbax.checkpoint as ocp
 from matd3_jax.core import replay
 from matd3_jax.errors import UserError
 from matd3_jax.runtime import files
-from matd3_jax.runtime.multihost import ALONE, Share
-from matd3_jax.training.loop import TrainLoop, TrainState
+from matd3_jax.runtime.multihost import SINGLE_PROCESS, Share
+from matd3_jax.training.loop import TrainLoop
+from matd3_jax.training.state import TrainState
 
 RENAMED = ((".rollouts", ".collects"), ("_optimizer", "_optimiser"))
-"""Parts of leaves' paths, and what checkpoints from before have in their place."""
+"""Parts of leaves' paths, and what older checkpoints have instead."""
 
 ASIDE = ".set_aside"
 """At the end of the names of checkpoints that a run no longer leads to."""
 
-logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax tells of every step at INFO and warns of its own defaults.
+logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax logs every step at INFO and warns of its own defaults.
 
 
 def save(
@@ -50,11 +51,11 @@ def save(
     """Write the checkpoint of env step `step` and delete all but the newest `keep`.
 
     Args:
-        seeds: write these seeds' part alone, without their replay: enough to evaluate them, not to go on. None: all.
+        seeds: write these seeds' part alone, without their replay: enough to evaluate them, not to resume. None: all.
         share: which seeds the trainer has. Every process writes its own, the first makes a checkpoint of it. None:
             there are no others.
     """
-    share = share or ALONE.share(trainer.num_seeds)
+    share = share or SINGLE_PROCESS.share(trainer.num_seeds)
     processes, wanted = share.processes, seeds or slice(0, share.total)
     folder = folder.resolve()
     final, partial_ = folder / str(step), folder / f".{step}.partial"
@@ -79,7 +80,7 @@ def save(
             written.append(partial_ / "replay" / str(share.first + seed))
             checkpointer.save(there / written[-1].relative_to(partial_), {"rows": rows})
             checkpointer.wait_until_finished()
-    parts = processes.collect(json.dumps(_checksums(partial_, written)).encode())
+    parts = processes.gather_messages(json.dumps(_checksums(partial_, written)).encode())
     if processes.first:
         checksums = dict(sorted(pair for part in parts for pair in json.loads(part).items()))
         files.write_json(partial_ / "checksums.json", checksums)
@@ -144,7 +145,7 @@ def verify(folder: Path, step: int | None = None) -> Path:
         damaged = "checksums.json"
     if damaged is not None:
         before = [other for other in found if other < step]
-        hint = f"go on from the one before it with checkpoint={before[-1]}" if before else "there is none before it"
+        hint = f"resume from the one before it with checkpoint={before[-1]}" if before else "there is none before it"
         raise UserError(f"the checkpoint {folder / str(step)} is damaged ({damaged}); {hint}")
     return path
 
@@ -156,31 +157,31 @@ def restore(path: Path, trainer: TrainLoop, share: Share | None = None) -> Train
     share: which of the checkpoint's seeds the trainer has; None: all.
     """
     if not (path / "replay").is_dir():
-        raise UserError(f"{path} holds no replay: what a sweep leaves of a run can be evaluated, not gone on with")
-    share = share or ALONE.share(trainer.num_seeds)
+        raise UserError(f"{path} holds no replay: what a sweep leaves of a run can be evaluated, not resumed")
+    share = share or SINGLE_PROCESS.share(trainer.num_seeds)
     small = _rebuild(trainer, path, share)
     with ocp.StandardCheckpointer() as checkpointer:
-        filled = trainer.filled_rows(int(small.rollouts))
+        filled = trainer.schedule.filled_rows(int(small.rollouts))
         local = []
-        for device, seeds in trainer.device_seeds():
+        for device, seeds in trainer.sharding.device_seeds():
             shape = (len(seeds), trainer.schedule.replay_capacity, trainer.layout.row_size)
             rows = jax.device_put(jnp.zeros(shape, jnp.float32, device=device), device)
-            for place, seed in enumerate(seeds):
+            for index, seed in enumerate(seeds):
                 if not filled:
                     continue
                 one = np.asarray(checkpointer.restore(path / "replay" / str(share.first + seed))["rows"])
                 if one.shape[0] > shape[1] or one.shape[0] < filled or one.shape[1] != shape[2]:
                     raise UserError(f"{path}: a replay of shape {one.shape} does not fit these settings")
-                rows = _put_rows(rows, jax.device_put(one[None], device), place)
+                rows = _put_rows(rows, jax.device_put(one[None], device), index)
             local.append(rows)
-    shape = (trainer.rows, trainer.schedule.replay_capacity, trainer.layout.row_size)
+    shape = (trainer.sharding.padded_seeds, trainer.schedule.replay_capacity, trainer.layout.row_size)
     rows = jax.make_array_from_single_device_arrays(shape, trainer.shardings.replay, local)
     return small._replace(replay=rows)
 
 
 def restore_actors(path: Path, trainer: TrainLoop) -> TrainState:
-    """The state without its replay (an empty one in its place): enough to evaluate."""
-    return _rebuild(trainer, path, ALONE.share(trainer.num_seeds))
+    """The state without its replay (an empty one instead): enough to evaluate."""
+    return _rebuild(trainer, path, SINGLE_PROCESS.share(trainer.num_seeds))
 
 
 def read_state(path: Path, first: int, last: int, total: int) -> dict[str, np.ndarray]:
@@ -203,20 +204,20 @@ def read_state(path: Path, first: int, last: int, total: int) -> dict[str, np.nd
 
 
 @partial(jax.jit, donate_argnums=0, static_argnums=2)
-def _put_rows(rows: jax.Array, one: jax.Array, place: int) -> jax.Array:
-    return jax.lax.dynamic_update_slice(rows, one, (place, 0, 0))
+def _put_rows(rows: jax.Array, one: jax.Array, index: int) -> jax.Array:
+    return jax.lax.dynamic_update_slice(rows, one, (index, 0, 0))
 
 
 def _replay_rows(trainer: TrainLoop, state: TrainState):
     """(seed number, its filled rows) one after the other."""
-    filled = trainer.filled_rows(int(state.rollouts))
+    filled = trainer.schedule.filled_rows(int(state.rollouts))
     for shard in state.replay.addressable_shards:
         if shard.replica_id:
             continue  # a copy on another device that works on the same seeds
         first = shard.index[0].start or 0
-        for place in range(shard.data.shape[0]):
-            if first + place < trainer.num_seeds:
-                yield first + place, np.asarray(shard.data[place, :filled])
+        for index in range(shard.data.shape[0]):
+            if first + index < trainer.num_seeds:
+                yield first + index, np.asarray(shard.data[index, :filled])
 
 
 def _leaves(trainer: TrainLoop, state: TrainState, seeds: slice) -> dict[str, np.ndarray]:
@@ -245,10 +246,11 @@ def _rebuild(trainer: TrainLoop, path: Path, share: Share) -> TrainState:
         value = saved.get(now, saved.get(before, nothing))
         if value.shape != wanted or value.dtype != leaf.dtype:
             raise UserError(f"{path}: {jax.tree_util.keystr(name)} does not fit these settings")
-        leaves.append(value if not leaf.ndim else np.asarray(trainer.fill(value)))
+        leaves.append(value if not leaf.ndim else np.asarray(trainer.sharding.pad(value)))
     state = jax.tree.unflatten(treedef, leaves)
     state = state._replace(
-        key=jax.random.wrap_key_data(jnp.asarray(state.key)), replay=replay.allocate(trainer.rows, 0, 0)
+        key=jax.random.wrap_key_data(jnp.asarray(state.key)),
+        replay=replay.allocate(trainer.sharding.padded_seeds, 0, 0),
     )
     return jax.device_put(state, trainer.shardings)
 

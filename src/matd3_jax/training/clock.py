@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import jax
 
 _compiled: list[tuple[float, float]] = []
-"""Stretches of time (begin, end) in which this process traced and compiled programs, in order."""
+"""Times (begin, end) in which this process traced and compiled programs, in order."""
 
 
 def _note(event: str, duration_secs: float, **_: str | int) -> None:

@@ -179,24 +179,24 @@ def expectation(training: TrainingSession, done: int = 0) -> str:
     critic = (update.critic_input_size(layout, group), *group.algorithm.hidden, group.critic.num_outputs)
     layer = max(pairwise(critic), key=lambda sizes: sizes[0] * sizes[1])
     # Larger products are done at the same rate, and take longer to measure.
-    shape = (min(size, 1024) for size in (schedule.batch_size // trainer.devices_per_seed, *layer))
-    places = tuple(trainer.mesh.devices.flat)
-    products = product_rate(places, *shape)
-    physics = physics_rate(training.env, places, trainer.local_seeds * schedule.num_envs)
+    shape = (min(size, 1024) for size in (schedule.batch_size // trainer.sharding.devices_per_seed, *layer))
+    used = tuple(trainer.mesh.devices.flat)
+    products = product_rate(used, *shape)
+    physics = physics_rate(training.env, used, trainer.sharding.local_seeds * schedule.num_envs)
     steps = training.total_steps - done
-    learning = training.total_steps - max(done, trainer.warmup_steps)
-    evaluations = training.evaluations_after(max(done, trainer.warmup_steps))
+    learning = training.total_steps - max(done, trainer.schedule.warmup_steps)
+    evaluations = training.evaluations_after(max(done, trainer.schedule.warmup_steps))
     if not done and training.eval_every:
         evaluations += 1  # of the untrained policies
     evaluated = evaluations * training.config.eval_episodes * training.env.episode_length
     updates = learning * schedule.updates_per_collect / schedule.rollout_steps
     flops = (steps + evaluated) * acting_flops(layout) + updates * update_flops(layout, schedule)
-    seconds = trainer.rows * flops / (REACHED * products)
+    seconds = trainer.sharding.padded_seeds * flops / (REACHED * products)
     how = f"products at {products / 1e9:.3g} GFLOP/s measured on these devices"
     if physics is None:
         how += "; the environment's own time is not counted"
     else:
-        seconds += trainer.local_seeds * (steps + evaluated) / physics  # a device steps its own seeds
+        seconds += trainer.sharding.local_seeds * (steps + evaluated) / physics  # a device steps its own seeds
         how += f", physics {_rounded(physics):,} env steps/s a core"
     return f"expected: {duration(seconds)}, compiling apart ({how})"
 

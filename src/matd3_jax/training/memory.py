@@ -7,8 +7,9 @@ import jax
 
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError
-from matd3_jax.training.loop import TrainLoop, idle_devices
+from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.session import TrainingSession
+from matd3_jax.training.sharding import idle_devices
 
 PROCESS = 1_300_000_000
 """Bytes of the process itself: interpreter, libraries, compiler, programs (docs/performance.md)."""
@@ -22,27 +23,27 @@ def needed(trainer: TrainLoop, seeds: int) -> int:
     """
     devices = len(jax.local_devices())
     each = idle_devices(devices, seeds, trainer.schedule.batch_size) if trainer.on_cpu else 1
-    places = min(seeds, devices // each)
-    rows = math.ceil(seeds / places) * places
+    shares = min(seeds, devices // each)
+    rows = math.ceil(seeds / shares) * shares
     copies = each * rows  # a seed's state is on all the devices that work on it
-    replay = trainer.replay_bytes // (trainer.rows * trainer.devices_per_seed)
-    together = places if trainer.on_cpu else rows  # seeds updated at the same time
+    replay = trainer.replay_bytes // (trainer.sharding.padded_seeds * trainer.sharding.devices_per_seed)
+    together = shares if trainer.on_cpu else rows  # seeds updated at the same time
     # A checkpoint is written seed by seed: one seed's replay on its way out, and once more in the writer's hands.
     return PROCESS + copies * (replay + seed_bytes(trainer)) + together * update_bytes(trainer) + 2 * replay
 
 
 def seed_bytes(trainer: TrainLoop) -> int:
-    """Bytes of one seed beside its replay: its state, twice while it changes, and a rollout with its fresh starts."""
+    """Bytes of one seed without its replay: its state, twice while it changes, and a rollout with its fresh starts."""
     schedule, layout = trainer.schedule, trainer.layout
     state = trainer.abstract_state()
-    whole = size(state._replace(replay=None, rollouts=None)) // trainer.rows  # type: ignore[arg-type]
-    one_env = size(state.env) // (trainer.rows * schedule.num_envs)
+    whole = size(state._replace(replay=None, rollouts=None)) // trainer.sharding.padded_seeds  # type: ignore[arg-type]
+    one_env = size(state.env) // (trainer.sharding.padded_seeds * schedule.num_envs)
     # Each transition of a rollout: its row, what it is packed from, and a fresh start.
     return 2 * whole + schedule.rollout_steps * (2 * 4 * layout.row_size + 2 * one_env)
 
 
 def update_bytes(trainer: TrainLoop) -> int:
-    """Bytes that one seed's update takes beside its state: minibatches, noise, activations and their gradients."""
+    """Bytes that one seed's update takes besides its state: minibatches, noise, activations and their gradients."""
     layout, schedule = trainer.layout, trainer.schedule
     agents = 1 if trainer.on_cpu else layout.num_agents  # agents updated at the same time
     widest = max(
@@ -60,7 +61,7 @@ def most_seeds(trainer: TrainLoop, budget: int) -> int:
     """The largest number of seeds, a multiple of the devices where it can be, that `needed` says fit into `budget`
     bytes. Raises UserError, with the arithmetic, where not even one does."""
     if needed(trainer, 1) > budget:
-        capacity, replay = trainer.schedule.replay_capacity, trainer.replay_bytes / trainer.rows
+        capacity, replay = trainer.schedule.replay_capacity, trainer.replay_bytes / trainer.sharding.padded_seeds
         raise UserError(
             f"one seed needs {needed(trainer, 1) / 1e9:.2f} GB, {replay / 1e9:.2f} GB of it for a replay of "
             f"{capacity:,} transitions, but only {budget / 1e9:.2f} GB may be used"

@@ -7,6 +7,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
+from matd3_jax.stats.text import plus_minus
 from matd3_jax.training.clock import compiling
 from matd3_jax.training.session import Row, TrainingSession
 
@@ -46,7 +47,7 @@ class ProgressBar:
             self.bar.start()
 
     def log(self, row: Row) -> None:
-        """Tell of one more interval."""
+        """Show one more interval."""
         self.now, self.compiled = time.monotonic(), compiling()
         self._note(row)
         text = self.text()
@@ -152,7 +153,7 @@ def _spread(values: np.ndarray) -> str:
     values = values[~np.isnan(values)]
     if not len(values):
         return "nan"
-    return f"{values.mean():.1f}" + (f" ± {values.std(ddof=1):.1f}" if len(values) > 1 else "")
+    return plus_minus(values.mean(), values.std(ddof=1) if len(values) > 1 else None, ".1f", ".1f")
 
 
 def _duration(seconds: float) -> str:

@@ -15,14 +15,14 @@ from matd3_jax.errors import UserError
 from matd3_jax.runs import lock
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import devices
-from matd3_jax.runtime.multihost import ALONE, Processes
+from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.training import announcement, checkpoint, finish
 from matd3_jax.training.loggers import Logger, TableLogger, TensorBoardLogger
-from matd3_jax.training.loop import TrainState
 from matd3_jax.training.progress import ProgressBar
 from matd3_jax.training.run import Outcome, run
 from matd3_jax.training.session import Row, TrainingSession
+from matd3_jax.training.state import TrainState
 
 Say = Callable[[str], None]
 
@@ -48,7 +48,7 @@ class Recorder:
 
     def __init__(
         self,
-        processes: Processes = ALONE,
+        processes: Processes = SINGLE_PROCESS,
         heed_signals: bool = False,
         say: Say | None = None,
         loggers: Sequence[Logger] = (),
@@ -95,13 +95,13 @@ class Recorder:
             training = self._checked(settings, env)
             stop = self._stop()
             there = bool(checkpoint.steps(directory.checkpoints)) if self.processes.first else None
-            if not self.processes.tell(there) and step is None:
+            if not self.processes.broadcast(there) and step is None:
                 self.say("no checkpoint yet: this run starts anew")
                 if self.processes.first:
                     directory.clear()
                 return self._from_the_start(training, directory, stop)
             saved = Path(
-                self.processes.tell(
+                self.processes.broadcast(
                     str(checkpoint.verify(directory.checkpoints, step)) if self.processes.first else None
                 )
             )
@@ -139,7 +139,7 @@ class Recorder:
         done = int(saved.name)
         row = {"step": np.array([done])}
         if done >= training.total_steps:
-            if self.processes.tell(directory.summary() is not None if self.processes.first else None):
+            if self.processes.broadcast(directory.summary() is not None if self.processes.first else None):
                 raise UserError(
                     f"{directory.path} is at env step {done:,} of {training.total_steps:,}: to train on, raise "
                     "total_steps="
@@ -169,7 +169,7 @@ class Recorder:
         if table.damaged:
             plural = "s" * (table.damaged > 1)
             self.say(f"note: {directory.metrics} had {table.damaged} damaged line{plural}, left out now")
-        first, interval = training.trainer.warmup_steps, training.interval_steps
+        first, interval = training.trainer.schedule.warmup_steps, training.interval_steps
         gaps = table.gaps(first, done, interval, training.share.total)
         if gaps:
             shown = ", ".join(f"{a:,} and {b:,}" for a, b in gaps[:3]) + (", ..." if len(gaps) > 3 else "")

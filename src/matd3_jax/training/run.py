@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.training.loggers import Logger
-from matd3_jax.training.loop import TrainState
 from matd3_jax.training.session import Row, TrainingSession
+from matd3_jax.training.state import TrainState
 
 SHARE = 20
 """Checkpoints by time take at most one part in so many of a run."""
@@ -21,7 +21,7 @@ class Outcome(NamedTuple):
     row: Row
     """Of the last logging interval."""
     stopped: Signals | None
-    """The signal that ended it; None where it came to its end."""
+    """The signal that ended it; None where it was trained to its end."""
 
 
 def run(

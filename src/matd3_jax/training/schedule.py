@@ -8,10 +8,9 @@ import math
 class Schedule:
     """Static.
 
-    Collect `num_envs * rollout_length` env steps, then `updates_per_collect` updates; actors and targets move with
-    every policy_delay-th update. The unit that the scan repeats (an iteration) is the shortest stretch of whole
-    rollouts that holds every algorithm's delay a whole number of times, so that the delay is structure and not a
-    condition.
+    A rollout of `num_envs * rollout_length` env steps, then `updates_per_collect` updates; actors and targets move with
+    every policy_delay-th update. The unit that the scan repeats (an iteration) is the least number of rollouts whose
+    updates hold every algorithm's delay a whole number of times, so that the delay is structure and not a condition.
     """
 
     num_envs: int = 4
@@ -38,3 +37,12 @@ class Schedule:
     def warmup_rollouts(self) -> int:
         """Rollouts before the loop: the first rollout of the loop then reaches `learning_starts`."""
         return max(0, math.ceil(self.learning_starts / self.rollout_steps) - 1)
+
+    @property
+    def warmup_steps(self) -> int:
+        """Env steps before the loop."""
+        return self.warmup_rollouts * self.rollout_steps
+
+    def filled_rows(self, rollouts: int) -> int:
+        """Transitions in each seed's replay after `rollouts` rollouts."""
+        return min(rollouts, self.replay_capacity // self.rollout_steps) * self.rollout_steps

@@ -20,10 +20,12 @@ from matd3_jax.envs.wrappers.joint_team import JointTeam
 from matd3_jax.errors import UserError
 from matd3_jax.runs import overestimation
 from matd3_jax.runtime import devices
-from matd3_jax.runtime.multihost import ALONE, Processes
+from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.training.clock import Clock
-from matd3_jax.training.loop import Metrics, Program, TrainLoop, TrainState
+from matd3_jax.training.evaluator import Evaluator
+from matd3_jax.training.loop import Program, TrainLoop
 from matd3_jax.training.schedule import Schedule
+from matd3_jax.training.state import Metrics, TrainState
 
 Row = dict[str, np.ndarray]
 """Columns of the metrics table for one interval: each [seeds]; "step" and "seed" among them."""
@@ -37,7 +39,7 @@ take some 3 % of a robot's training with the fast recipe, less with others."""
 
 
 class TrainingSession:
-    """Programs and plan of one run, or of several that share a program (a piece of a sweep).
+    """Programs and plan of one run, or of several that share a program (a batch of a sweep).
 
     Args:
         config: checked settings.
@@ -55,7 +57,7 @@ class TrainingSession:
         config: Config,
         env: Environment | None = None,
         members: Sequence[Config] | None = None,
-        processes: Processes = ALONE,
+        processes: Processes = SINGLE_PROCESS,
     ):
         self.config, self.processes = config, processes
         self.members = (config,) if members is None else tuple(members)
@@ -93,12 +95,12 @@ class TrainingSession:
         trainer = TrainLoop(self.env, self.layout, schedule, hyper, seeds, local, **options)
         # Whole intervals of equal length, so that one compiled program does for all; as many as come closest to
         # log_every.
-        iterations = max(1, math.ceil((config.total_steps - trainer.warmup_steps) / trainer.iteration_steps))
+        iterations = max(1, math.ceil((config.total_steps - trainer.schedule.warmup_steps) / trainer.iteration_steps))
         wanted = max(1, round((config.log_every or config.total_steps / 100) / trainer.iteration_steps))
         self.num_intervals = math.ceil(iterations / wanted)
         self.iterations_per_interval = math.ceil(iterations / self.num_intervals)
         self.total_steps = (
-            trainer.warmup_steps + self.num_intervals * self.iterations_per_interval * trainer.iteration_steps
+            trainer.schedule.warmup_steps + self.num_intervals * self.iterations_per_interval * trainer.iteration_steps
         )
         """Env steps of each seed: the first whole interval at or after the wanted number."""
         # Rows that would never be written are not allocated: the same result in less memory.
@@ -106,6 +108,7 @@ class TrainingSession:
         schedule = dataclasses.replace(schedule, replay_capacity=capacity)
         kept = config.diagnostics.q_bias_rollouts if config.diagnostics.q_bias else 0
         self.trainer = TrainLoop(self.env, self.layout, schedule, hyper, seeds, local, q_bias_pairs=kept, **options)
+        self.evaluator = Evaluator(self.trainer)
 
     def _hyper(self, team: str) -> HyperParams:
         """The team's hyper-parameters, leaves [seeds]."""
@@ -118,17 +121,18 @@ class TrainingSession:
     def memory(self) -> str:
         """The arithmetic of the replay's memory."""
         t, s = self.trainer, self.layout
-        copies = f"{t.devices_per_seed} copies x " if t.devices_per_seed > 1 else ""
+        copies = f"{t.sharding.devices_per_seed} copies x " if t.sharding.devices_per_seed > 1 else ""
         whose = f" of process {self.processes.index}" if self.processes.size > 1 else ""
         return (
-            f"replay{whose}: {t.rows} seeds x {copies}{t.schedule.replay_capacity:,} transitions x {s.row_size} "
-            f"numbers x 4 bytes = {t.replay_bytes / 1e9:.2f} GB (x {s.observation_size}, actions {s.action_size}, "
-            f"rewards {s.num_agents}, {'more 1, ' if s.n_step > 1 else ''}x' {s.observation_size}, discount 1)"
+            f"replay{whose}: {t.sharding.padded_seeds} seeds x {copies}{t.schedule.replay_capacity:,} transitions x "
+            f"{s.row_size} numbers x 4 bytes = {t.replay_bytes / 1e9:.2f} GB "
+            f"(x {s.observation_size}, actions {s.action_size}, rewards "
+            f"{s.num_agents}, {'more 1, ' if s.n_step > 1 else ''}x' {s.observation_size}, discount 1)"
         )
 
     def check_memory(self) -> None:
         """Raise UserError, with the arithmetic, if the replay cannot fit."""
-        free = devices.free_memory(self.processes.here)
+        free = devices.free_memory(self.processes.local)
         if self.trainer.replay_bytes > free:
             raise UserError(
                 f"{self.memory}, but only {free / 1e9:.2f} GB are free: fewer seeds, or replay_capacity at most "
@@ -138,7 +142,7 @@ class TrainingSession:
     # ---- running -----------------------------------------------------------------------------------------------------
 
     def keys(self) -> jax.Array:
-        """One key a seed; a seed's key does not depend on the seeds beside it."""
+        """One key a seed; a seed's key does not depend on the other seeds."""
         return jax.vmap(jax.random.key)(self.seeds)
 
     def start(self) -> tuple[TrainState, Row]:
@@ -249,7 +253,7 @@ class TrainingSession:
         # Apart from the training's keys, which are split from key(seed).
         key = jax.random.fold_in(jax.random.key(seed), 2**31 - 1)
         keys = jax.vmap(lambda _: key)(self.seeds)
-        found = self.trainer.evaluate(state, keys, episodes, deterministic)
+        found = self.evaluator.evaluate(state, keys, episodes, deterministic)
         return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), found)
 
     def _evaluated(self, state: TrainState, due: bool) -> tuple[TrainState, Row]:
@@ -281,12 +285,12 @@ class TrainingSession:
 
     def q_bias(self, state: TrainState, due: bool) -> tuple[TrainState, Row]:
         """The state with its reservoir restarted, and what an evaluation says of the critics (see
-        `overestimation.columns`); the same state and nan where none is due, or nothing was collected since the last.
+        `overestimation.columns`); the same state and nan where none is due, or there was no rollout since the last.
         No columns with diagnostics.q_bias off."""
         if state.reservoir is None:
             return state, {}
         found = None
         if due and int(state.rollouts) > int(state.reservoir.since):
-            found = self.trainer.measure_q_bias(state, self.config.diagnostics.q_bias_steps)
-            state = self.trainer.restart_reservoir(state)
+            found = self.evaluator.measure_q_bias(state, self.config.diagnostics.q_bias_steps)
+            state = self.evaluator.restart_reservoir(state)
         return state, overestimation.columns(self.layout.agents, found, len(self.seeds))

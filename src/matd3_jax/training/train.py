@@ -14,10 +14,10 @@ from matd3_jax.envs.check import check
 from matd3_jax.envs.environment import Environment
 from matd3_jax.runtime import devices
 from matd3_jax.training.loggers import CallbackLogger, HistoryLogger, Logger
-from matd3_jax.training.loop import TrainState
 from matd3_jax.training.recording import Recorded, Recorder
 from matd3_jax.training.run import run
 from matd3_jax.training.session import Row, TrainingSession
+from matd3_jax.training.state import TrainState
 
 
 @dataclasses.dataclass

@@ -12,7 +12,7 @@ from matd3_jax.envs.particle.task import ParticleTask
 from matd3_jax.envs.point_reach import PointReach
 from matd3_jax.envs.wrappers.joint_team import JointTeam
 from matd3_jax.errors import UserError
-from matd3_jax.figures.palette import BLACK, WHITE, Color
+from matd3_jax.figures.style import BLACK, WHITE, Color
 from matd3_jax.video import plane
 from matd3_jax.video.mujoco_renderer import RobotDrawing
 from matd3_jax.video.scene2d import Drawing, OwnDrawing, SceneDrawing

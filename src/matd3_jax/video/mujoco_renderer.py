@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from matd3_jax.figures.palette import AGENT, Color
+from matd3_jax.figures.style import AGENT, Color
 from matd3_jax.video import opengl
 from matd3_jax.video.scene2d import Drawing
 
@@ -18,7 +18,7 @@ FLOOR: tuple[Color, Color] = ((196, 202, 210), (226, 230, 235))
 DISTANCE = 3.0
 """Of the camera, in half lengths of the robot."""
 SMOOTHING = 4
-"""The camera follows the mean place of the torso over this many frames before and after."""
+"""The camera follows the mean position of the torso over this many frames before and after."""
 
 
 class RobotDrawing(Drawing):
@@ -49,6 +49,8 @@ class RobotDrawing(Drawing):
         data = mujoco.MjData(model)
         qpos = _finite(np.asarray(selected, np.float64))
         camera, path = _camera(model, data, qpos), _smooth(_torso_path(model, data, qpos))
+        # Not `mujoco.Renderer`: it draws with the OpenGL that MuJoCo chose when it was imported, GLFW on Linux unless
+        # MUJOCO_GL says otherwise, and closing one while another is current spoils the other's pictures (3.17.0).
         scene, option, perturb = mujoco.MjvScene(model, 10_000), mujoco.MjvOption(), mujoco.MjvPerturb()
         rect = mujoco.MjrRect(0, 0, width, height)
         context = self.new_context(width, height)
@@ -56,8 +58,8 @@ class RobotDrawing(Drawing):
         renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         try:
             mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, renderer)
-            for place, center in zip(qpos, path, strict=True):
-                data.qpos[:] = place
+            for position, center in zip(qpos, path, strict=True):
+                data.qpos[:] = position
                 mujoco.mj_forward(model, data)
                 camera.lookat[:2] = center
                 mujoco.mjv_updateScene(model, data, option, perturb, camera, mujoco.mjtCatBit.mjCAT_ALL, scene)
@@ -126,8 +128,8 @@ def _torso_path(model: Any, data: Any, qpos: np.ndarray) -> np.ndarray:
     import mujoco
 
     path = []
-    for place in qpos:
-        data.qpos[:] = place
+    for position in qpos:
+        data.qpos[:] = position
         mujoco.mj_kinematics(model, data)
         path.append(data.xpos[1, :2].copy())
     return np.array(path)
@@ -147,8 +149,8 @@ def _camera(model: Any, data: Any, qpos: np.ndarray) -> Any:
     data.qpos[:] = qpos[0]
     mujoco.mj_kinematics(model, data)
     own = model.geom_bodyid > 0
-    place, around = data.geom_xpos[own], model.geom_rbound[own]
-    low, high = (place - around[:, None]).min(axis=0), (place + around[:, None]).max(axis=0)
+    position, around = data.geom_xpos[own], model.geom_rbound[own]
+    low, high = (position - around[:, None]).min(axis=0), (position + around[:, None]).max(axis=0)
     camera = mujoco.MjvCamera()
     camera.distance = DISTANCE * float((high - low).max()) / 2
     camera.lookat[2] = (max(low[2], 0) + high[2]) / 2

@@ -6,7 +6,7 @@ import numpy as np
 
 from matd3_jax.envs.particle.task import ParticleTask
 from matd3_jax.envs.particle.world import State
-from matd3_jax.figures.palette import DARK_GREY, GREEN, GREY, PALE_GREEN, PURPLE, TEAM, YELLOW, Color
+from matd3_jax.figures.style import DARK_GREY, GREEN, GREY, PALE_GREEN, PURPLE, TEAM, YELLOW, Color
 from matd3_jax.video.plane import Disc, Scene
 
 LANDMARK: dict[str, Color] = {

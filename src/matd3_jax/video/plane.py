@@ -6,10 +6,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from matd3_jax.figures.palette import BLACK, GREEN, PURPLE, WHITE, Color
+from matd3_jax.figures.style import BLACK, GREEN, PURPLE, WHITE, Color
 
 OVERSAMPLING = 3
-"""Drawn so many times larger and then shrunk: smooth edges."""
+"""How many times larger pictures are drawn before they are shrunk: smooth edges."""
 MARGIN = 1.08
 """The view reaches this much farther than what it has to show."""
 LEAST_RADIUS = 0.013
@@ -43,7 +43,7 @@ class Disc:
     ringed: bool = False
     """With a ring around it, to stand out by shape as well."""
     message: np.ndarray | None = None
-    """[frames, entries] between 0 and 1: a bar for each entry, beside the disc."""
+    """[frames, entries] between 0 and 1: a bar for each entry, next to the disc."""
     marked: int | None = None
     """The entry of the message that is green."""
 
@@ -51,7 +51,7 @@ class Disc:
     def moves(self) -> bool:
         return self.position.ndim == 2
 
-    def place(self, frame: int) -> np.ndarray:
+    def position_at(self, frame: int) -> np.ndarray:
         """[2]."""
         return self.position[frame] if self.moves else self.position
 
@@ -71,9 +71,9 @@ class Scene:
         """(center [2], half the side) of a square, one for the whole episode, that holds [-1, 1]^2 and every disc."""
         low, high = np.full(2, -1.0), np.full(2, 1.0)
         for disc in self.discs:
-            places = disc.position.reshape(-1, 2)
-            low = np.minimum(low, places.min(axis=0) - disc.radius)
-            high = np.maximum(high, places.max(axis=0) + disc.radius)
+            positions = disc.position.reshape(-1, 2)
+            low = np.minimum(low, positions.min(axis=0) - disc.radius)
+            high = np.maximum(high, positions.max(axis=0) + disc.radius)
         return (low + high) / 2, MARGIN * float((high - low).max()) / 2
 
     def images(self, side: int) -> Iterator[Image.Image]:
@@ -92,9 +92,9 @@ class _Painter:
         self.font = font(max(9, round(side * 0.034)))
         self.background = self._background()
 
-    def pixel(self, place: np.ndarray) -> np.ndarray:
-        """Pixels (right, down) of a place [2] in the world."""
-        unit = (np.asarray(place, float) - self.center) / (2 * self.half)
+    def pixel(self, position: np.ndarray) -> np.ndarray:
+        """Pixels (right, down) of a position [2] in the world."""
+        unit = (np.asarray(position, float) - self.center) / (2 * self.half)
         return np.array([0.5 + unit[0], 0.5 - unit[1]]) * self.side
 
     def radius(self, disc: Disc) -> float:
@@ -138,7 +138,7 @@ class _Painter:
         pen.rectangle((*low, *high), fill=color)
 
     def _disc(self, pen: ImageDraw.ImageDraw, disc: Disc, frame: int) -> None:
-        x, y = self.pixel(disc.place(frame)) * OVERSAMPLING
+        x, y = self.pixel(disc.position_at(frame)) * OVERSAMPLING
         r = self.radius(disc) * OVERSAMPLING
         pen.ellipse((x - r, y - r, x + r, y + r), fill=(*disc.color, OPACITY if disc.moves else 255))
         if disc.moves:
@@ -151,7 +151,7 @@ class _Painter:
     def _label(self, pen: ImageDraw.ImageDraw, disc: Disc, frame: int) -> None:
         if not disc.label:
             return
-        x, y = self.pixel(disc.place(frame))
+        x, y = self.pixel(disc.position_at(frame))
         r = self.radius(disc)
         if np.hypot(self.font.getlength(disc.label), 0.7 * self.font.size) < 1.9 * r:
             pen.text((x, y), disc.label, fill=WHITE, font=self.font, anchor="mm")
@@ -163,12 +163,12 @@ class _Painter:
 
     def _label_below(self, disc: Disc, frame: int) -> bool:
         """There is room for it there."""
-        return self.pixel(disc.place(frame))[1] + self.radius(disc) + LABEL * self.font.size < self.side
+        return self.pixel(disc.position_at(frame))[1] + self.radius(disc) + LABEL * self.font.size < self.side
 
     def _chart_box(self, disc: Disc, frame: int) -> Edges:
         """Where a message goes: above its disc, or below the label where there is no room above. In the picture."""
         assert disc.message is not None
-        x, y = self.pixel(disc.place(frame))
+        x, y = self.pixel(disc.position_at(frame))
         width = min(BAR * disc.message.shape[1], WIDEST_CHART) * self.side
         height, label = CHART * self.side, LABEL * self.font.size
         bottom = y - self.radius(disc) - 5 - (0 if self._label_below(disc, frame) else label)

@@ -4,7 +4,7 @@ import numpy as np
 
 from matd3_jax.envs.point_reach import PointReach, PointState
 from matd3_jax.errors import OptionError
-from matd3_jax.figures.palette import BLUE, GREEN, Color
+from matd3_jax.figures.style import BLUE, GREEN, Color
 from matd3_jax.video.plane import Disc, Scene
 
 RADIUS, TARGET_RADIUS = 0.06, 0.05
@@ -20,12 +20,12 @@ def scene(env: PointReach, states: PointState) -> Scene:
     """
     if env.dim > 2:
         raise OptionError(f"dim={env.dim}: only a line or a plane can be drawn")
-    pos, target = (_on_plane(np.asarray(place)) for place in (states.pos, states.target[0]))
+    pos, target = (_on_plane(np.asarray(points)) for points in (states.pos, states.target[0]))
     discs = [Disc(target, TARGET_RADIUS, GREEN, ringed=True)]
     discs += [Disc(pos[:, i], RADIUS, BLUE, label=str(i)) for i in range(env.num_agents)]
     return Scene(discs)
 
 
-def _on_plane(place: np.ndarray) -> np.ndarray:
+def _on_plane(points: np.ndarray) -> np.ndarray:
     """[..., 2] from [..., dim]."""
-    return np.pad(place, [(0, 0)] * (place.ndim - 1) + [(0, 2 - place.shape[-1])])
+    return np.pad(points, [(0, 0)] * (points.ndim - 1) + [(0, 2 - points.shape[-1])])

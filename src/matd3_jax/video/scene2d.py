@@ -11,7 +11,7 @@ from PIL import Image
 from matd3_jax.envs.particle.task import ParticleTask
 from matd3_jax.envs.point_reach import PointReach
 from matd3_jax.errors import UserError
-from matd3_jax.figures.palette import Color
+from matd3_jax.figures.style import Color
 from matd3_jax.video import particle as particle_drawing
 from matd3_jax.video import point_reach
 

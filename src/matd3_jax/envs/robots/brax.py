@@ -38,7 +38,7 @@ class BraxRobot(Environment):
     [-1, 1] for each joint (brax scales the humanoid's to its motors).
 
     The full observation is brax's: generalized positions without those along the floor, and velocities (m, rad, m/s,
-    rad/s; hopper's and walker2d's velocities clipped to [-10, 10]). The humanoid's goes on with inertia [10] and
+    rad/s; hopper's and walker2d's velocities clipped to [-10, 10]). The humanoid's continues with inertia [10] and
     velocity [6] of each of 11 links and the motors' forces [23]. No contact forces. Sizes: ant 27, half_cheetah 17,
     hopper 11, walker2d 17, humanoid 244, swimmer 8.
 

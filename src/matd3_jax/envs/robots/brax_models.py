@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from matd3_jax.envs.robots.partition.partition import KinematicTree, Layout, describe, lay_out
 from matd3_jax.envs.robots.quiet import quiet, quiet_mujoco
 from matd3_jax.errors import OptionError
+from matd3_jax.private import brax_fluid
 
 BACKENDS = ("spring", "positional", "generalized")
 
@@ -64,12 +65,10 @@ def import_brax() -> Any:
 @contextlib.contextmanager
 def calling() -> Iterator[None]:
     """Circumstances in which brax's own functions are called."""
-    import brax.fluid
-
     # brax 0.14.2 passes clip a keyword that JAX has dropped since; only the swimmer's water needs it.
     numpy = types.SimpleNamespace(**vars(jnp) | {"clip": lambda x, a_min: jnp.clip(x, min=a_min)})
     # TF32, a GPU's default for matrix products, is too coarse for physics.
-    with quiet(), mock.patch.object(brax.fluid, "jp", numpy), jax.default_matmul_precision("highest"):
+    with quiet(), mock.patch.object(brax_fluid(), "jp", numpy), jax.default_matmul_precision("highest"):
         yield
 
 

@@ -89,7 +89,7 @@ class Robot(Environment):
 
     @abc.abstractmethod
     def healthy(self, qpos: chex.Array, qvel: chex.Array) -> chex.Array:
-        """Boolean scalar: the episode goes on."""
+        """Boolean scalar: the episode continues."""
 
     @abc.abstractmethod
     def rewards(self, speed: chex.Array, control: chex.Array, sensed: tuple, healthy: chex.Array) -> tuple:

@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator, MutableMapping
 import jax.numpy as jnp
 import mujoco
 
-from matd3_jax.envs.robots.engines.quietly import collision_driver, collision_primitive
+from matd3_jax.private import Moved, mjx_collider, mjx_collisions
 
 PLANE_CAPSULE = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_CAPSULE)
 
 
-@collision_primitive.collider(ncon=2)
+@mjx_collider(contacts=2)
 def plane_capsule(plane, capsule):
     """Contacts of a capsule's two ends with a plane: distance [2], position [2, 3], frame [2, 3, 3] (rows: normal, two
     tangents).
@@ -33,13 +33,10 @@ def plane_capsule(plane, capsule):
 
 
 def table() -> MutableMapping[tuple, Callable]:
-    """MJX's private table of collision functions. Raises RuntimeError if this version keeps it elsewhere."""
-    found = getattr(collision_driver, "_COLLISION_FUNC", None)
-    if not isinstance(found, dict) or PLANE_CAPSULE not in found:
-        raise RuntimeError(
-            f"mujoco-mjx {mujoco.__version__} looks its collision functions up elsewhere: "
-            "install mujoco==3.17.0 and mujoco-mjx==3.17.0"
-        )
+    """MJX's private table of collision functions. Raises Moved if this version has none of a plane and a capsule."""
+    found = mjx_collisions()
+    if PLANE_CAPSULE not in found:
+        raise Moved(f"mujoco-mjx {mujoco.__version__} has no collision function of plane and capsule in its table")
     return found
 
 

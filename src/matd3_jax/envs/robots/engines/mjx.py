@@ -12,6 +12,7 @@ from matd3_jax.envs.robots.engines.contact_frame import as_in_c
 from matd3_jax.envs.robots.engines.engine import Physical
 from matd3_jax.envs.robots.engines.models import corrected
 from matd3_jax.envs.robots.engines.quietly import mjx
+from matd3_jax.private import mjx_implementation
 
 NEWTON = {"mjx": (8, 8), "mjx_fast": (1, 4)}
 """Iterations of the Newton solver and of its line search. In float32, 8 and 8 give what MuJoCo's default of 100 and 50
@@ -39,7 +40,7 @@ class MjxEngine:
         data = self.data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=qacc_warmstart, ctrl=control)
         rk4 = self.mj_model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
         step = runge_kutta.step if rk4 else mjx.step
-        # TF32 products, which GPUs take for float32 unless told otherwise, wreck the physics.
+        # TF32 products, which GPUs take for float32 by default, wreck the physics.
         with as_in_c(), jax.default_matmul_precision("highest"):
             data = jax.lax.scan(lambda d, _: (step(self.model, d), None), data, length=frame_skip)[0]
             if "cfrc_ext" in fields:  # MJX leaves it at 0 otherwise
@@ -54,9 +55,8 @@ class MjxEngine:
 
 
 def _physical(data: mjx.Data, fields: tuple[str, ...]) -> Physical:
-    # Asking the data for what stands in its implementation works, with a warning.
     own = {field.name for field in dataclasses.fields(data)}
-    found = {name: getattr(data if name in own else data._impl, name) for name in fields}
+    found = {name: getattr(data if name in own else mjx_implementation(data), name) for name in fields}
     return Physical(data.qpos, data.qvel, data.qacc_warmstart, found)
 
 

@@ -4,6 +4,5 @@ from matd3_jax.envs.robots.quiet import quiet
 
 with quiet():
     from mujoco import mjx
-    from mujoco.mjx._src import collision_driver, collision_primitive, forward
 
-__all__ = ["collision_driver", "collision_primitive", "forward", "mjx"]
+__all__ = ["mjx"]

@@ -4,7 +4,8 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from matd3_jax.envs.robots.engines.quietly import forward, mjx
+from matd3_jax.envs.robots.engines.quietly import mjx
+from matd3_jax.private import mjx_integrate_positions
 
 
 def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -15,10 +16,10 @@ def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     `qpos` and `qvel` is left as the last stage computed it.
     """
     dt = model.opt.timestep
-    start = data
+    start, move = data, mjx_integrate_positions()
 
     def integrate(qvel: chex.Array) -> chex.Array:
-        return forward._integrate_pos(model.jnt_type, start.qpos, qvel, dt)
+        return move(model.jnt_type, start.qpos, qvel, dt)
 
     def stage(carry, factors):
         data, qvel_sum, qacc_sum = carry

@@ -27,8 +27,8 @@ class Layout:
 
     def entry(self, name: str, index: int) -> tuple[int, ...]:
         """All entries of the quantity `name` (a field's) at `index`: none where it is not observed."""
-        places = getattr(self, name)
-        first = places[index] if index < len(places) else None
+        offsets = getattr(self, name)
+        first = offsets[index] if index < len(offsets) else None
         return () if first is None else tuple(range(first, first + _WIDTHS.get(name, 1)))
 
 

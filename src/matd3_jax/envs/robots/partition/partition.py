@@ -54,7 +54,7 @@ def as_split(split: Any) -> Split:
 
 
 def default_split(robot: str) -> str:
-    """Name of the partition that `robot` has unless told otherwise: `halves` for ant, MaMuJoCo's first for others."""
+    """Name of the partition that `robot` has by default: `halves` for ant, MaMuJoCo's first for others."""
     return next(iter(GRAPHS[robot].splits))
 
 
@@ -73,7 +73,7 @@ def partition(robot: str, tree: KinematicTree, layout: Layout, split: Any, depth
     `depth` says what an agent sees:
 
     - a number: what MaMuJoCo shows with `agent_obsk=depth`, in the same order. Of the agent's own joints position and
-      velocity, and what the robot observes of bodies beside them and of actuator forces; of joints up to `depth` steps
+      velocity, and what the robot observes of bodies next to them and of actuator forces; of joints up to `depth` steps
       away in the joint graph the position; lastly position and velocity of the root.
     - None: for MaMuJoCo's partitions depth 1, as there; for `halves` and own partitions the paper's observation:
       position and velocity of the root; positions, velocities, and (where the robot observes them) inertias,
@@ -81,7 +81,7 @@ def partition(robot: str, tree: KinematicTree, layout: Layout, split: Any, depth
 
     An agent's entries are a selection from the full observation, clipped where that is clipped. MaMuJoCo reads them
     from the simulator instead and differs in one place: it does not clip the velocities of walker2d, which the full
-    observation clips to [-10, 10]. It shows a body's quantities with every joint beside it, hence the torso's with
+    observation clips to [-10, 10]. It shows a body's quantities with every joint next to it, hence the torso's with
     every hip and shoulder; the paper's observation has none of the torso's.
 
     Raises OptionError for an unknown split or joint, a joint without or with two agents, an agent without joints, and

@@ -11,8 +11,9 @@ import numpy as np
 from benchmarks import throughput
 from benchmarks.gpu.report import Row
 from matd3_jax import config
-from matd3_jax.training.loop import TrainLoop, TrainState
+from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.session import TrainingSession
+from matd3_jax.training.state import TrainState
 
 
 class Length(NamedTuple):
@@ -21,7 +22,7 @@ class Length(NamedTuple):
     iterations: int = 10
     """Of one call of the program."""
     seconds: float = 1.0
-    """Of one timed stretch of calls."""
+    """Of one timed block of calls."""
     repeats: int = 3
 
 
@@ -88,22 +89,22 @@ def compiled(at: Setting, part: str, iterations: int, options: dict[str, Any] | 
 
 
 def timed(program: Compiled, state: TrainState, length: Length) -> tuple[TrainState, Row]:
-    """The state after the calls, and rates over all seeds: median, slowest and fastest of the stretches."""
+    """The state after the calls, and rates over all seeds: median, slowest and fastest of the blocks."""
     trainer, calls = program.trainer, 1
 
-    def stretch(state: TrainState) -> tuple[TrainState, float]:
+    def block(state: TrainState) -> tuple[TrainState, float]:
         begun = time.perf_counter()
         for _ in range(calls):
             state = program(state)
         jax.block_until_ready(state)
         return state, (time.perf_counter() - begun) / (calls * program.iterations)
 
-    state, _ = stretch(state)  # the first call loads kernels
-    state, iteration = stretch(state)
+    state, _ = block(state)  # the first call loads kernels
+    state, iteration = block(state)
     calls = max(1, round(length.seconds / (iteration * program.iterations)))
     times = []
     for _ in range(length.repeats):
-        state, iteration = stretch(state)
+        state, iteration = block(state)
         times.append(iteration)
     steps = trainer.num_seeds * trainer.iteration_steps
     updates = trainer.num_seeds * trainer.rollouts_per_iteration * trainer.schedule.updates_per_collect

@@ -14,9 +14,9 @@ def run(report: Report, scale: float) -> None:
 
 
 def iteration(count: int) -> Row:
-    """The floor of an iteration of simple_spread at the paper's settings."""
+    """The roofline of an iteration of simple_spread at the paper's settings."""
     trainer = TrainingSession(config.load(seeds.settings(count, 100_000))).trainer
-    found, products = limits.floor(trainer, repeats=3)
+    found, products = limits.roofline(trainer, repeats=3)
     return {
         "products_seconds": found.alone,
         "bytes_seconds": found.moved,

@@ -1,0 +1,73 @@
+"""What training carries from iteration to iteration, and what it begins with."""
+
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from matd3_jax.core import q_bias, rollout, running_statistics, update
+from matd3_jax.core.agents import JointLayout
+from matd3_jax.core.q_bias import Reservoir
+from matd3_jax.core.rollout import EnvState, Episodes
+from matd3_jax.core.running_statistics import Statistics
+from matd3_jax.core.update import GroupState, UpdateMetrics
+from matd3_jax.envs.environment import Environment
+
+
+class TrainState(NamedTuple):
+    """Everything that training carries; leading axis [seeds] but for `rollouts`."""
+
+    groups: tuple[GroupState, ...]
+    env: EnvState
+    replay: chex.Array
+    """[seeds, capacity, row_size]"""
+    key: chex.PRNGKey
+    rollouts: chex.Array
+    """int32 scalar: rollouts done, warm-up included. Steps, updates and the replay's cursor follow from it."""
+    statistics: Statistics | None = None
+    """Of the observations in all rollouts; None where they are not normalized."""
+    reservoir: Reservoir | None = None
+    """What the critics are judged on (see `q_bias`); None where they are not. `since` has no axis [seeds]."""
+
+
+class Metrics(NamedTuple):
+    """Of one interval: leading axes [seeds, iterations]."""
+
+    episodes: Episodes
+    """Sums over the episodes that ended in the iteration."""
+    update: UpdateMetrics
+    """Means over the updates of the iteration (actor_loss over those that moved the actor)."""
+
+
+def prefix(seeds: Any, everywhere: Any, normalize: bool, reservoir: bool) -> TrainState:
+    """Make a prefix tree of the state: `seeds` for leaves with the axis [seeds], `everywhere` for those without."""
+    statistics = seeds if normalize else None
+    kept = Reservoir(seeds, everywhere) if reservoir else None
+    return TrainState(seeds, seeds, seeds, seeds, everywhere, statistics, kept)
+
+
+def initial(
+    env: Environment, layout: JointLayout, num_envs: int, normalize: bool, q_bias_pairs: int, keys: chex.PRNGKey
+) -> TrainState:
+    """Begin the runs of `keys` [seeds], with an empty replay.
+
+    Args:
+        normalize: with running statistics of the observations.
+        q_bias_pairs: states and actions that the reservoir has room for; 0: there is none.
+    """
+
+    def one(key):
+        network_key, env_key, key = jax.random.split(key, 3)
+        return update.init(layout, network_key), rollout.start(env, env_key, num_envs, rollout.ranged(layout)), key
+
+    groups, envs, keys = jax.vmap(one)(keys)
+    state = TrainState(groups, envs, jnp.zeros((keys.shape[0], 0, 0)), keys, jnp.int32(0))
+    if q_bias_pairs:
+        pairs = jax.vmap(lambda s: q_bias.allocate(s, q_bias_pairs, layout))(envs.state)
+        state = state._replace(reservoir=Reservoir(pairs, jnp.int32(0)))
+    if not normalize:
+        return state
+    fresh = running_statistics.initial(layout.observation_size)
+    spread = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (keys.shape[0], *leaf.shape)), fresh)
+    return state._replace(statistics=spread)
