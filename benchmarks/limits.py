@@ -119,7 +119,7 @@ def _update(trainer: TrainLoop, group: Group) -> Iterator[tuple[Product, float]]
         sizes = (other.observation_size, *other.algorithm.hidden, other.action_space.size)
         members = (len(other.members),) if central else ()
         yield from ((part, 1 / shared) for part in _forward(members, batch, sizes))
-    critic = (update.critic_input_size(layout, group), *hidden, 1)
+    critic = (update.critic_input_size(layout, group), *hidden, group.critic.num_outputs)
     twins = algorithm.num_critics
     forward = [*_wide(twins, batch, critic), *_forward((twins,), batch, critic)[1:]]
     yield from ((part, 2) for part in forward)  # targets, and the critics themselves

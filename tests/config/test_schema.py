@@ -24,6 +24,10 @@ OTHER = {  # another value of each setting of an algorithm
     "actor_output": "tanh",
     "target_noise": 0.3,
     "sync_targets": False,
+    "critic_norm": "layer",
+    "critic_head": "categorical",
+    "critic_atoms": 11,
+    "critic_range": (-1.0, 2.0),
 }
 
 
@@ -98,6 +102,7 @@ def test_texts_are_taken_as_they_are_typed(text, tmp_path):
         ("algo.hidden=[8,0]", r"^algo.hidden=\[8, 0\]: each must be at least 1$"),
         ("algo.exploration_noise=[0.4,0.1]", "must not end below its start"),
         ("algo.exploration_noise=[-0.1,0.1]", "must not be negative"),
+        ("algo.critic_range=[-1,inf]", r"^algo.critic_range=\[-1.0, inf\]: each must be finite$"),
         ("algo.exploration_noise=inf", "must not be negative"),
         ("seed=3000000000", "^seed=3000000000: must lie between 0 and 2147483647$"),
         ("resum=a", "did you mean"),

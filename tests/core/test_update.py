@@ -128,7 +128,9 @@ def test_update_equals_reference(name):
     assert (clipped > 0) == (p.layout.algorithms[0].clip != "none")
 
 
-@pytest.mark.parametrize("name", ["matd3", "box", "n-step", "tanh", "matd3-shared-sequential"])
+@pytest.mark.parametrize(
+    "name", ["matd3", "box", "n-step", "tanh", "matd3-shared-sequential", "layer-norm", "categorical-3-steps"]
+)
 def test_large_minibatches_are_computed_alike(name, monkeypatch):
     """The program that large minibatches get (a loop over agents, products that transpose) against the reference."""
     monkeypatch.setattr(networks, "SMALL_BATCH", 0)
@@ -161,6 +163,7 @@ def test_some_norms_are_clipped_and_some_are_not():
         ("matd3", "sequential", True),
         ("matd3-shared-sequential", "sequential", False),
         ("interleaved", "sequential", False),
+        ("categorical", "algorithm.critic_range", (-2.0, 1.6)),
     ],
 )
 def test_reference_tells_apart(name, field, value):

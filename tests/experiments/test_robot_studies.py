@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments import evaluations, recipe, robots, squashing, study, tidy
+from experiments import critics, evaluations, recipe, robots, squashing, study, tidy
 from experiments.study import StudyOptions
 from experiments.tidy import Table
 
@@ -30,7 +30,7 @@ def words(claims):
     return [claim.verdict for claim in claims]
 
 
-@pytest.mark.parametrize("module", [squashing, robots, recipe])
+@pytest.mark.parametrize("module", [squashing, robots, recipe, critics])
 def test_tables_survive_their_file_and_every_setting_is_drawn(module, tmp_path):
     """Numbers beside texts in a column (a noise, a range of noise) stay different settings after reading, too."""
     labels = list(module.settings("paper", StudyOptions()))
@@ -69,6 +69,14 @@ def test_recipe():
     worse = base | {recipe.label(names[2]): 400.0}
     found = words(recipe.claims(table_of(recipe, worse)))
     assert found[2] == "opposite" and set(found[:2] + found[3:]) == {"same"}
+
+
+def test_critics():
+    """Each kind is compared with the recipe's critics on the same robot."""
+    levels = {label: 1000.0 for label in critics.settings("paper", {})}
+    levels |= {"half_cheetah-as_they_are": 2000.0, "half_cheetah-categorical": 2500.0, "ant-both": 700.0}
+    found = words(critics.claims(table_of(critics, levels)))
+    assert found == ["not shown", "not shown", "opposite", "opposite", "same", "opposite"]
 
 
 def test_robots():

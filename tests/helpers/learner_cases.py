@@ -92,6 +92,9 @@ def interleaved(algorithm) -> JointLayout:
     )
 
 
+DISTRIBUTION: Mapping = {"critic_head": "categorical", "critic_atoms": 7, "critic_range": (-2.0, 1.5)}
+"""So narrow that some returns are moved beyond both ends."""
+
 CASES = {
     # The six of the family, each as its configuration file says.
     "matd3": Case("simple_spread", "matd3", changes={"hidden": (6, 5)}),
@@ -133,6 +136,18 @@ CASES = {
     ),
     "tanh-own": Case("point_reach", "iltd3", changes={"actor_output": "tanh", "reward_scale": 0.1}, still=("agents",)),
     "scaled": Case("simple_tag", "matd3", changes={"reward_scale": 3.0, "actor_average": 0.1}, n_step=2),
+    # Critics.
+    "layer-norm": Case("simple_spread", "matd3", changes={"critic_norm": "layer", "hidden": (6, 5)}),
+    "layer-norm-own": Case(
+        "point_reach", "iltd3", changes={"critic_norm": "layer", "clip": "network", "smoothing": True}, shared=True
+    ),
+    "categorical": Case("simple_spread", "matd3", changes=DISTRIBUTION, one_by_one=False),
+    "categorical-3-steps": Case(
+        "simple_tag", "matd3", "maddpg", changes=DISTRIBUTION | {"reward_scale": 0.5}, n_step=3
+    ),
+    "categorical-layer-norm": Case(
+        "point_reach", "matd3", changes=DISTRIBUTION | {"critic_norm": "layer", "clip": "none"}, sequential=True
+    ),
     "discrete": Case(
         "simple_spread", "maddpg", options={"actions": "discrete"}, changes={"clip": "none", "adam": "epsilon_hat"}
     ),
@@ -152,8 +167,9 @@ def random_state(layout, rng):
             return np.full(leaf.shape, 3, leaf.dtype)
         if ".nu" in name:
             return np.exp(rng.uniform(np.log(1e-13), np.log(1e-3), leaf.shape))  # down to where epsilon matters
-        scale = 0.01 if ".mu" in name else 0.3 if "bias" in name else 1 / np.sqrt(leaf.shape[-2])
-        return rng.normal(0, scale, leaf.shape)
+        vector = any(word in name for word in ("bias", "gain", "shift"))
+        scale = 0.01 if ".mu" in name else 0.3 if vector else 1 / np.sqrt(leaf.shape[-2])
+        return rng.normal(1.0 if "gain" in name and ".mu" not in name else 0.0, scale, leaf.shape)
 
     return jax.tree_util.tree_map_with_path(fill, shapes)
 
@@ -185,9 +201,12 @@ def drawn(layout, rows, hyper):
 
 
 def layers(params, *place):
-    """[(kernel, bias)] of the network at `place` of a stack."""
-    pairs = [(params[f"kernel_{n}"], params[f"bias_{n}"]) for n in range(len(params) // 2)]
-    return [(np.array(kernel[place]), np.array(bias[place])) for kernel, bias in pairs]
+    """[(kernel, bias, ...)] of the network at `place` of a stack."""
+    names = ("kernel", "bias", "gain", "shift")
+    count = sum(name.startswith("kernel") for name in params)
+    return [
+        tuple(np.array(params[f"{name}_{n}"][place]) for name in names if f"{name}_{n}" in params) for n in range(count)
+    ]
 
 
 def adam(state: optax.ScaleByAdamState, member, *critic):

@@ -1,7 +1,8 @@
 """One update of the paper in NumPy float64 with hand-written gradients: what `update.update` is tested against.
 
 Written from the paper and the description of the authors' program, agent after agent and critic after critic; it knows
-nothing of jax, of groups or of stacked networks. Arrays are [batch, size]; a network is a list of (kernel, bias).
+nothing of jax, of groups or of stacked networks. Arrays are [batch, size]; a network is a list of layers (kernel,
+bias), with layer normalization (kernel, bias, gain, shift) for the hidden ones.
 """
 
 import copy
@@ -13,25 +14,95 @@ import numpy as np
 
 
 def forward(layers, x):
-    """Output of a ReLU perceptron with linear output, and what each layer read."""
-    read = []
-    for n, (kernel, bias) in enumerate(layers):
-        read.append(x)
-        x = x @ kernel + bias
-        if n < len(layers) - 1:
-            x = np.maximum(x, 0)
-    return x, read
+    """Output of a ReLU perceptron with linear output, and what each layer read and normalized."""
+    kept = []
+    for n, (kernel, bias, *norm) in enumerate(layers):
+        read, x, seen = x, x @ kernel + bias, None
+        if norm:
+            gain, shift = norm
+            scale = np.sqrt(x.var(axis=1, keepdims=True) + 1e-6)
+            unit = (x - x.mean(axis=1, keepdims=True)) / scale
+            x, seen = unit * gain + shift, (unit, scale)
+        on = x > 0 if n < len(layers) - 1 else np.ones_like(x, bool)
+        x = np.where(on, x, 0)
+        kept.append((read, seen, on))
+    return x, kept
 
 
-def backward(layers, read, slope):
-    """Gradients [(kernel, bias)] and the gradient of the input, for the gradient `slope` of the output."""
+def backward(layers, kept, slope):
+    """Gradients [(kernel, bias, ...)] and the gradient of the input, for the gradient `slope` of the output."""
     gradients = []
-    for n in reversed(range(len(layers))):
-        gradients.insert(0, (read[n].T @ slope, slope.sum(axis=0)))
-        slope = slope @ layers[n][0].T
-        if n:
-            slope = slope * (read[n] > 0)  # what layer n read is the ReLU of layer n - 1
+    for (kernel, _, *norm), (read, seen, on) in zip(reversed(layers), reversed(kept), strict=True):
+        slope, of_norm = slope * on, ()
+        if norm:
+            unit, scale = seen
+            of_norm = ((slope * unit).sum(axis=0), slope.sum(axis=0))
+            slope = slope * norm[0]
+            # The mean and the scale depend on all units of the row.
+            slope = slope - slope.mean(axis=1, keepdims=True) - unit * (slope * unit).mean(axis=1, keepdims=True)
+            slope = slope / scale
+        gradients.insert(0, (read.T @ slope, slope.sum(axis=0), *of_norm))
+        slope = slope @ kernel.T
     return gradients, slope
+
+
+# ---- heads of critics ------------------------------------------------------------------------------------------------
+
+
+class Scalar:
+    """Outputs [batch, 1]: the value itself."""
+
+    def __init__(self, algorithm):
+        pass
+
+    def value(self, output):
+        """(values [batch], slope of their sum with respect to the outputs)."""
+        return output[:, 0], np.ones_like(output)
+
+    def target(self, outputs, reward, discount):
+        """From the outputs of all target critics."""
+        return reward + discount * np.min([output[:, 0] for output in outputs], axis=0)
+
+    def loss(self, output, target):
+        """(mean loss, its slope with respect to the outputs)."""
+        error = output[:, 0] - target
+        return (error**2).mean(), 2 * error[:, None] / len(error)
+
+
+class Categorical:
+    """Outputs [batch, atoms]: logits of a distribution of returns (Bellemare et al. 2017, algorithm 1)."""
+
+    def __init__(self, algorithm):
+        self.low, self.high = algorithm.critic_range
+        self.count = algorithm.critic_atoms
+        self.spacing = (self.high - self.low) / (self.count - 1)
+        self.returns = np.array([self.low + k * self.spacing for k in range(self.count)])
+
+    def value(self, output):
+        p = softmax(output)
+        mean = p @ self.returns
+        return mean, p * (self.returns - mean[:, None])
+
+    def target(self, outputs, reward, discount):
+        chosen = np.zeros_like(outputs[0])
+        for b in range(len(chosen)):
+            each = [softmax(output)[b] for output in outputs]
+            p = min(each, key=lambda p: p @ self.returns)
+            for k in range(self.count):
+                moved = min(max(reward[b] + discount[b] * self.returns[k], self.low), self.high)
+                position = (moved - self.low) / self.spacing
+                lower = min(int(np.floor(position)), self.count - 2)
+                chosen[b, lower] += p[k] * (lower + 1 - position)
+                chosen[b, lower + 1] += p[k] * (position - lower)
+        return chosen
+
+    def loss(self, output, target):
+        p = softmax(output)
+        return -(target * np.log(p)).sum(axis=1).mean(), (p - target) / len(p)
+
+
+def head(algorithm):
+    return {"scalar": Scalar, "categorical": Categorical}[algorithm.critic_head](algorithm)
 
 
 # ---- actions ---------------------------------------------------------------------------------------------------------
@@ -94,7 +165,7 @@ def smooth(space, action, normal, sigma, bound):
 
 @dataclasses.dataclass
 class Adam:
-    """Moments [(kernel, bias)] and number of steps taken."""
+    """Moments [(kernel, bias, ...)] and number of steps taken."""
 
     first: list
     second: list
@@ -103,14 +174,14 @@ class Adam:
 
 def clip(gradients, mode, bound):
     """(gradients within the norm, number of the norms that were too large)."""
-    flat = [g for pair in gradients for g in pair]
+    flat = [g for layer in gradients for g in layer]
     if mode == "none":
         return gradients, 0
     norms = [np.sqrt((g**2).sum()) for g in flat]
     if mode == "network":
         norms = [np.sqrt(sum(norm**2 for norm in norms))] * len(flat)
-    scaled = [g * (bound / norm if norm > bound else 1) for g, norm in zip(flat, norms, strict=True)]
-    return list(zip(scaled[::2], scaled[1::2], strict=True)), sum(norm > bound for norm in norms)
+    scaled = iter([g * (bound / norm if norm > bound else 1) for g, norm in zip(flat, norms, strict=True)])
+    return [tuple(next(scaled) for _ in layer) for layer in gradients], sum(norm > bound for norm in norms)
 
 
 def adam_step(layers, state, gradients, lr, kind):
@@ -209,6 +280,7 @@ def update(agents, batches, gumbel, normal, move, sequential):
             rows = long_step(rows, agents, h.gamma)
         x, a, r, next_x, discount = take_apart(rows, agents)
         batch, central = len(batches[i]), algorithm.critic == "central"
+        critic = head(algorithm)
 
         # Target: r + gamma min_j Q'_j(x', mu'(o')), bootstrapping unless terminated.
         next_a = []
@@ -220,21 +292,21 @@ def update(agents, batches, gumbel, normal, move, sequential):
                 action = smooth(other.space, action, noise, h.target_noise, h.target_noise_clip)
             next_a.append(action)
         read = np.concatenate([*next_x, *next_a] if central else [next_x[i], next_a[i]], axis=1)
-        values = [forward(target, read)[0][:, 0] for target in agent.critic_targets]
-        y = algorithm.reward_scale * r[i] + h.gamma * discount * np.min(values, axis=0)
+        outputs = [forward(target, read)[0] for target in agent.critic_targets]
+        y = critic.target(outputs, algorithm.reward_scale * r[i], h.gamma * discount)
 
-        # Critics: mean squared error, each with its own optimizer.
+        # Critics: mean squared error or cross-entropy, each with its own optimizer.
         read = np.concatenate([*x, *a] if central else [x[i], a[i]], axis=1)
         losses = []
         for c in range(algorithm.num_critics):
             q, kept = forward(agent.critics[c], read)
-            error = q[:, 0] - y
-            losses.append((error**2).mean())
-            gradients, _ = backward(agent.critics[c], kept, 2 * error[:, None] / batch)
+            loss, slope = critic.loss(q, y)
+            losses.append(loss)
+            gradients, _ = backward(agent.critics[c], kept, slope)
             gradients, count = clip(gradients, algorithm.clip, h.max_grad_norm)
             clipped += count
             if c == 0:
-                metrics[1, i] = q.mean()
+                metrics[1, i] = critic.value(q)[0].mean()
             agent.critics[c], agent.critic_adams[c] = adam_step(
                 agent.critics[c], agent.critic_adams[c], gradients, h.critic_lr, algorithm.adam
             )
@@ -247,8 +319,9 @@ def update(agents, batches, gumbel, normal, move, sequential):
         own, kept_act = act(agent.space, output, gumbel(agent.space.size), algorithm.actor_output)
         mixed = [own if j == i else a[j] for j in range(len(agents))]
         q, kept_q = forward(agent.critics[0], np.concatenate([*x, *mixed] if central else [x[i], own], axis=1))
+        q, slope = critic.value(q)
         metrics[2, i] = -q.mean() + h.logit_regularizer * (output**2).mean()
-        _, slope = backward(agent.critics[0], kept_q, np.full((batch, 1), -1 / batch))
+        _, slope = backward(agent.critics[0], kept_q, -slope / batch)
         start = sum(o.shape[1] for o in x) + sum(o.shape[1] for o in a[:i]) if central else x[i].shape[1]
         slope = act_slope(agent.space, kept_act, slope[:, start : start + agent.space.size])
         slope = slope + h.logit_regularizer * 2 * output / output.size

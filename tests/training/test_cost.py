@@ -30,6 +30,7 @@ def training(*settings, **options):
         (*ANT, "env.split=halves"),
         ("env=ant", "env.split=4x2", *WIDE),
         (*ANT, "algo=td3"),
+        (*ANT, "algo.critic_head=categorical", "algo.critic_range=[-50,500]", "algo.critic_atoms=21"),
         ("env=hopper", "env.split=[[thigh_joint],[leg_joint],[foot_joint]]", *WIDE, "algo.policy_delay=4"),
     ],
     ids=" ".join,

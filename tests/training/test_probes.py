@@ -25,6 +25,10 @@ ALGORITHMS = {
     "matd3": Algorithm(hidden=(16,), clip="none"),
     "maddpg": Algorithm(hidden=(16,), clip="none", num_critics=1, policy_delay=1),
     "iddpg": Algorithm(hidden=(16,), clip="none", num_critics=1, policy_delay=1, critic="own"),
+    "matd3-layer-norm": Algorithm(hidden=(16,), clip="none", critic_norm="layer"),
+    "matd3-categorical": Algorithm(
+        hidden=(16,), clip="none", critic_head="categorical", critic_atoms=49, critic_range=(-6.0, 6.0)
+    ),
 }
 HYPER = HYPER._replace(
     gamma=GAMMA,
@@ -117,7 +121,7 @@ def values(name, agent, seed=CRITICS):
         inputs = np.concatenate([x[:, i], action[:, 2 * i : 2 * i + 2]], axis=1)
     assert (x[:, i] == x[:, 0]).all() and len(inputs) == 3200
     q, _ = reference.forward(layers(groups[g].critic, seed, k, 0), inputs)
-    return x[:, i], action, q[:, 0]
+    return x[:, i], action, reference.head(layout.algorithms[i]).value(q)[0]
 
 
 @pytest.mark.parametrize("agent", ["late", "constant", "signal"])

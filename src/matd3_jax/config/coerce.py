@@ -31,6 +31,10 @@ def _convert(key: str, value: Any, hint: Any) -> Any:
         if value is None:
             return None
         hint = next(option for option in options if option is not type(None))
+    if hint == tuple[float, float]:
+        if isinstance(value, list | tuple) and len(value) == 2:
+            return tuple(_convert(key, end, float) for end in value)
+        raise UserError(f"{key}={value!r}: must be a range [low,high]")
     if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
         return float(value)
     if hint is int and isinstance(value, float) and value.is_integer():

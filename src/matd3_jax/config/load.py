@@ -18,6 +18,7 @@ from matd3_jax.config.schema import ADDED_LATER, RENAMED, TEXTS, AlgoConfig, Con
 from matd3_jax.config.validate import check
 from matd3_jax.errors import OptionError, UserError, nearest
 from matd3_jax.groups import GROUPS, known_names
+from matd3_jax.runtime import files
 
 ROBOT_RECIPE = "fast"
 """What robots train by unless a recipe is given, on every machine."""
@@ -142,7 +143,7 @@ def text(config: Config) -> str:
 
 def write(config: Config, path: Path) -> None:
     """Leave every resolved value in a YAML file."""
-    path.write_text(text(config))
+    files.write_text(path, text(config))
 
 
 def from_dict(values: Mapping[str, Any]) -> Config:

@@ -84,6 +84,10 @@ class AlgoConfig:
     actor_output: str = setting(SHAPES, choices=("sigmoid", "tanh"), before="sigmoid")
     actor_average: float = setting(SHAPES, least=0, most=1, before=0.0)
     reward_scale: float = setting(SHAPES, above=0, before=1.0)
+    critic_norm: str = setting(SHAPES, choices=("none", "layer"), before="none")
+    critic_head: str = setting(SHAPES, choices=("scalar", "categorical"), before="scalar")
+    critic_atoms: int = setting(SHAPES, least=2, before=51)
+    critic_range: tuple[float, float] | None = setting(SHAPES, before=None)
 
     def algorithm(self) -> Algorithm:
         """What fixes the shape of the learner."""

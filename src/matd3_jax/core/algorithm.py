@@ -17,6 +17,14 @@ class Algorithm:
     """"central": the critics see the joint observation and all actions; "own": the agent's own parts only."""
     num_critics: int = 2
     """The target takes the minimum over that many target critics; the actor climbs the first."""
+    critic_norm: Literal["none", "layer"] = "none"
+    """"layer": layer normalization before each ReLU of the critics."""
+    critic_head: Literal["scalar", "categorical"] = "scalar"
+    """What a critic gives: a number, or a distribution over atoms (C51)."""
+    critic_atoms: int = 51
+    """Atoms of the categorical head."""
+    critic_range: tuple[float, float] | None = None
+    """Returns at the first and last atom, in units of the scaled rewards; needed by the categorical head."""
     policy_delay: int = 2
     """Actor and targets move with every policy_delay-th update (d in the paper)."""
     hidden: tuple[int, ...] = (64, 64)

@@ -29,6 +29,10 @@ class Critic(Protocol):
     ) -> chex.Array:
         """r + discount * min_j Q'_ij(next inputs), leading axis [batch]; reward, discount: [batch]."""
 
+    @property
+    def num_outputs(self) -> int:
+        """Width of each critic's last layer, for those who count operations and bytes."""
+
     def loss(self, params: chex.ArrayTree, inputs: chex.Array, target: chex.Array) -> tuple[chex.Array, chex.Array]:
         """(loss [critics], values Q_i1 of the first critic [batch])."""
 
@@ -41,25 +45,50 @@ class Critic(Protocol):
 
 def of(algorithm: Algorithm) -> Critic:
     """The critics of an algorithm's agents."""
-    return ScalarCritic(algorithm.num_critics, algorithm.hidden)
+    network = (algorithm.num_critics, algorithm.hidden, algorithm.critic_norm == "layer")
+    if algorithm.critic_head == "scalar":
+        return ScalarCritic(*network)
+    assert algorithm.critic_range is not None
+    return CategoricalCritic(*network, algorithm.critic_atoms, algorithm.critic_range)
 
 
 @dataclasses.dataclass(frozen=True)
-class ScalarCritic:
-    """Critics that give one number each; a mean squared error."""
+class _Perceptrons:
+    """Twins as one stacked network; a head says what its outputs mean."""
 
     num_critics: int
     hidden: tuple[int, ...]
+    layer_norm: bool
+
+    @property
+    def num_outputs(self) -> int:
+        return 1
 
     def network(self, critics: int) -> StackedMLP:
-        """So many critics as one network: inputs [batch, inputs] to outputs [critics, batch, 1]."""
-        return StackedMLP((critics,), (*self.hidden, 1))
+        """So many critics as one network: inputs [batch, inputs] to outputs [critics, batch, num_outputs]."""
+        return StackedMLP((critics,), (*self.hidden, self.num_outputs), self.layer_norm)
 
     def init(self, key: chex.PRNGKey, inputs: int) -> chex.ArrayTree:
         return self.network(self.num_critics).init(key, jnp.zeros((1, inputs)))["params"]
 
+    def outputs(self, params: chex.ArrayTree, inputs: chex.Array) -> chex.Array:
+        """[critics, batch, num_outputs]."""
+        return apply(self.network(self.num_critics), params, inputs)
+
+    def first_output(
+        self, params: chex.ArrayTree, inputs: chex.Array, change: chex.Array, column: chex.Array | int
+    ) -> chex.Array:
+        """Outputs [batch, num_outputs] of the first critic, its inputs changed as `Critic.value` has it."""
+        first: Any = jax.tree.map(lambda p: p[:1], params)
+        return apply(self.network(1), first, inputs, change, column)[0]
+
+
+@dataclasses.dataclass(frozen=True)
+class ScalarCritic(_Perceptrons):
+    """Critics that give one number each; a mean squared error."""
+
     def values(self, params: chex.ArrayTree, inputs: chex.Array) -> chex.Array:
-        return apply(self.network(self.num_critics), params, inputs)[..., 0]
+        return self.outputs(params, inputs)[..., 0]
 
     def target(
         self, params: chex.ArrayTree, reward: chex.Array, discount: chex.Array, next_inputs: chex.Array
@@ -73,5 +102,58 @@ class ScalarCritic:
     def value(
         self, params: chex.ArrayTree, inputs: chex.Array, change: chex.Array, column: chex.Array | int
     ) -> chex.Array:
-        first: Any = jax.tree.map(lambda p: p[:1], params)
-        return apply(self.network(1), first, inputs, change, column)[0, :, 0]
+        return self.first_output(params, inputs, change, column)[:, 0]
+
+
+@dataclasses.dataclass(frozen=True)
+class CategoricalCritic(_Perceptrons):
+    """Critics that give a distribution of returns over fixed atoms (C51, Bellemare et al. 2017); a cross-entropy.
+
+    The value is the distribution's mean. The target is the distribution of the critic with the smaller mean, moved to
+    r + discount * z and shared out between the neighboring atoms.
+    """
+
+    atoms: int
+    support: tuple[float, float]
+    """Returns at the first and last atom; what lies outside counts as the nearer of them."""
+
+    @property
+    def num_outputs(self) -> int:
+        return self.atoms
+
+    @property
+    def returns(self) -> chex.Array:
+        """z [atoms], evenly spaced."""
+        return jnp.linspace(*self.support, self.atoms)
+
+    def mean(self, probabilities: chex.Array) -> chex.Array:
+        """Expected returns [...] of distributions [..., atoms]."""
+        return (probabilities * self.returns).sum(axis=-1)
+
+    def values(self, params: chex.ArrayTree, inputs: chex.Array) -> chex.Array:
+        return self.mean(jax.nn.softmax(self.outputs(params, inputs)))
+
+    def target(
+        self, params: chex.ArrayTree, reward: chex.Array, discount: chex.Array, next_inputs: chex.Array
+    ) -> chex.Array:
+        probabilities = jax.nn.softmax(self.outputs(params, next_inputs))
+        smallest = jax.nn.one_hot(self.mean(probabilities).argmin(axis=0), self.num_critics, axis=0)
+        return self.project((smallest[..., None] * probabilities).sum(axis=0), reward, discount)
+
+    def project(self, probabilities: chex.Array, reward: chex.Array, discount: chex.Array) -> chex.Array:
+        """The distributions [batch, atoms] of reward + discount * return, on the atoms themselves."""
+        low, high = self.support
+        moved = jnp.clip(reward[:, None] + discount[:, None] * self.returns, low, high)
+        position = (moved - low) * ((self.atoms - 1) / (high - low))
+        # An atom takes its share of all mass within one spacing of it: [batch, atom, mass], summed as it is made.
+        distance = jnp.abs(position[:, None, :] - jnp.arange(self.atoms)[:, None])
+        return (jnp.maximum(1 - distance, 0) * probabilities[:, None, :]).sum(axis=-1)
+
+    def loss(self, params: chex.ArrayTree, inputs: chex.Array, target: chex.Array) -> tuple[chex.Array, chex.Array]:
+        logs = jax.nn.log_softmax(self.outputs(params, inputs))
+        return -(target * logs).sum(axis=-1).mean(axis=-1), self.mean(jnp.exp(logs[0]))
+
+    def value(
+        self, params: chex.ArrayTree, inputs: chex.Array, change: chex.Array, column: chex.Array | int
+    ) -> chex.Array:
+        return self.mean(jax.nn.softmax(self.first_output(params, inputs, change, column)))

@@ -58,7 +58,8 @@ def target_actions(
 def critic_loss(
     group: Group, params: chex.ArrayTree, batch: Minibatch, target: chex.Array
 ) -> tuple[chex.Array, tuple[chex.Array, chex.Array]]:
-    """sum_j mean (Q_ij(x, a_1, ..., a_N) - y_i)^2; also (its mean over the critics j, mean Q_i1)."""
+    """sum_j mean (Q_ij(x, a_1, ..., a_N) - y_i)^2, or the critics' cross-entropy to the target distribution; also (its
+    mean over the critics j, mean Q_i1)."""
     loss, value = group.critic.loss(params, batch.inputs, target)
     return loss.sum(), (loss.mean(), value.mean())
 

@@ -19,6 +19,9 @@ class StackedMLP(nn.Module):
     stack: tuple[int, ...]
     features: tuple[int, ...]
     """Widths of the hidden layers and of the output."""
+    layer_norm: bool = False
+    """Normalize the inputs of every ReLU over the layer's units, then scale and shift each unit by learned numbers
+    [*stack, width], which start at 1 and 0 (Ba et al. 2016)."""
 
     @nn.compact
     def __call__(self, x: chex.Array, correction: chex.Array | None = None, column: chex.Array | int = 0) -> chex.Array:
@@ -41,9 +44,21 @@ class StackedMLP(nn.Module):
                 k = correction.shape[-1]
                 y = y + _product(correction, jax.lax.dynamic_slice_in_dim(kernel, column, k, axis=-2))
             y = y + bias[..., None, :]
-            x = y if layer == len(self.features) - 1 else nn.relu(y)
+            if layer == len(self.features) - 1:
+                return y
+            if self.layer_norm:
+                gain = self.param(f"gain_{layer}", nn.initializers.ones, (*self.stack, width))
+                shift = self.param(f"shift_{layer}", nn.initializers.zeros, (*self.stack, width))
+                y = normalized(y) * gain[..., None, :] + shift[..., None, :]
+            x = nn.relu(y)
             inputs = width
-        return x
+        raise ValueError("a network has at least an output layer")
+
+
+def normalized(x: chex.Array) -> chex.Array:
+    """x shifted and scaled to mean 0 and variance 1 along its last axis, 1e-6 added to the variance."""
+    centered = x - x.mean(axis=-1, keepdims=True)
+    return centered * jax.lax.rsqrt(jnp.square(centered).mean(axis=-1, keepdims=True) + 1e-6)
 
 
 SMALL_BATCH = 512

@@ -35,7 +35,7 @@ class UpdateMetrics(NamedTuple):
     """Of one update, [num_agents] each."""
 
     critic_loss: chex.Array
-    """Mean squared error, averaged over the critics of the agent."""
+    """Mean squared error, or the categorical head's cross-entropy, averaged over the critics of the agent."""
     q_value: chex.Array
     """Mean value that the first critic gives to the replayed joint actions."""
     actor_loss: chex.Array

@@ -7,6 +7,7 @@ import dataclasses
 import importlib
 from typing import Any
 
+from matd3_jax.envs.check import check
 from matd3_jax.envs.environment import Environment, TimeStep
 from matd3_jax.envs.spaces import ActionSpace, Box, Discrete, MultiDiscrete, Simplex
 from matd3_jax.errors import OptionError, nearest
@@ -20,6 +21,7 @@ __all__ = [
     "OptionError",
     "Simplex",
     "TimeStep",
+    "check",
     "make",
     "names",
     "options",

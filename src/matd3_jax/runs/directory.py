@@ -1,6 +1,5 @@
 """The run directory: settings, versions, the metrics table, checkpoints and pictures of one run."""
 
-import csv
 import json
 import os
 import shlex
@@ -15,7 +14,10 @@ from matd3_jax import config as configuration
 from matd3_jax.config import Config
 from matd3_jax.config.diff import differing, learning, text
 from matd3_jax.errors import UserError
+from matd3_jax.runs import metrics_table
+from matd3_jax.runs.metrics_table import MetricsTable
 from matd3_jax.runs.paths import check_directory
+from matd3_jax.runtime import files
 
 
 class RunDirectory:
@@ -53,7 +55,7 @@ class RunDirectory:
             raise UserError(f"cannot make the run directory {path}: {error.strerror}") from error
         run = cls(path)
         configuration.write(config, path / "config.yaml")
-        (path / "machine.json").write_text(json.dumps(machine, indent=1) + "\n")
+        files.write_json(path / "machine.json", machine)
         return run
 
     @classmethod
@@ -67,12 +69,8 @@ class RunDirectory:
 
     def append(self, row: Mapping[str, np.ndarray]) -> None:
         """Add one row for each seed to the metrics table. row: columns [seeds], the same ones every time."""
-        new = not self.metrics.exists()
-        with self.metrics.open("a", newline="") as file:
-            writer = csv.writer(file)
-            if new:
-                writer.writerow(row)
-            writer.writerows(zip(*(map(_text, column) for column in row.values()), strict=True))
+        new = not self.metrics.exists() or not self.metrics.stat().st_size
+        files.append_text(self.metrics, metrics_table.row_lines(row, header=new))
 
     def clear(self) -> None:
         """Take away all but settings and machine: the run begins anew."""
@@ -80,33 +78,40 @@ class RunDirectory:
             path.unlink(missing_ok=True)
         shutil.rmtree(self.checkpoints, ignore_errors=True)
 
-    def cut(self, step: int) -> None:
-        """Drop the rows after env step `step`: they will be written again."""
-        if not self.metrics.exists():
-            return
-        with self.metrics.open(newline="") as file:
-            header, *rows = csv.reader(file)
-        kept = [row for row in rows if int(row[0]) <= step]
-        partial = self.metrics.with_suffix(".partial")
-        with partial.open("w", newline="") as file:
-            csv.writer(file).writerows([header, *kept])
-        partial.replace(self.metrics)
+    def cut(self, step: int) -> MetricsTable:
+        """Drop the rows after env step `step`, which will be written again, and the lines that are not whole: what the
+        table has then, and how many damaged lines it had."""
+        kept = self.table().until(step)
+        if kept.rows:
+            files.write_text(self.metrics, kept.text())
+        else:
+            self.metrics.unlink(missing_ok=True)
+        return kept
+
+    def table(self) -> MetricsTable:
+        """The whole rows of the metrics table; none where there is no file."""
+        return metrics_table.parse(self.metrics.read_bytes() if self.metrics.is_file() else b"")
 
     def read_metrics(self) -> dict[str, np.ndarray]:
-        """The table as columns [rows], without the rows of an interval that is just being written.
+        """The table as columns [rows], without intervals that not all seeds have, as one that is just being written.
 
         Raises UserError if there is none yet.
         """
-        written = self.metrics.read_text() if self.metrics.is_file() else ""
-        header, *rows = csv.reader(written[: written.rfind("\n") + 1].splitlines() or [""])
-        while rows and sum(row[0] == rows[-1][0] for row in rows) < sum(row[0] == rows[0][0] for row in rows):
-            rows.pop()
-        if not rows:
+        table = self.table()
+        if not table.rows:
             raise UserError(f"{self.path} has no metrics yet: its first row comes when learning starts")
-        return {name: np.array([float(row[i]) for row in rows]) for i, name in enumerate(header)}
+        return table.columns()
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
-        (self.path / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
+        files.write_json(self.path / "summary.json", summary)
+
+    def summary(self) -> dict[str, Any] | None:
+        """What a finished run left; None where there is none, or none that is whole."""
+        try:
+            found = json.loads((self.path / "summary.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+        return found if isinstance(found, dict) and "total_steps" in found else None
 
 
 def _there(path: Path) -> str:
@@ -137,8 +142,3 @@ def together(paths: Sequence[Path]) -> dict[str, np.ndarray]:
     joined = {name: np.concatenate([table[name] for table in tables]) for name in columns}
     order = np.lexsort((joined["seed"], joined["step"]))
     return {name: column[order] for name, column in joined.items()}
-
-
-def _text(value: Any) -> str:
-    # Nine digits give every float32 back exactly.
-    return str(value) if isinstance(value, int | np.integer) else f"{value:.9g}"

@@ -20,7 +20,7 @@ from matd3_jax.errors import UserError
 from matd3_jax.figures import learning_curves, q_bias
 from matd3_jax.runs import overestimation, summary
 from matd3_jax.runs.directory import RunDirectory
-from matd3_jax.runtime import devices
+from matd3_jax.runtime import devices, files
 from matd3_jax.runtime.multihost import ALONE, Processes
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.sweep import batching
@@ -71,15 +71,13 @@ class Sweep:
             RunDirectory.create(self.runs / str(config.name), config, machine)
         if new:
             whole = [*self.pieces, *([str(config.name) for config in piece] for piece in new)]
-            partial = self._plan.with_suffix(".partial")
-            partial.write_text(json.dumps(whole, indent=1) + "\n")
-            partial.replace(self._plan)
+            files.write_json(self._plan, whole)
         existing = batching.existing_runs(self.runs)
         return {name: [self.runs / run for run in batching.missing(c, existing)[0]] for name, c in settings.items()}
 
     def finished(self, piece: int) -> bool:
         """Whether all runs of a piece are."""
-        return all((self.runs / name / "summary.json").exists() for name in self.pieces[piece])
+        return all(RunDirectory(self.runs / name).summary() is not None for name in self.pieces[piece])
 
     def train(self, only: Collection[int] | None = None) -> int:
         """Train the unfinished pieces, or those of `only`: the exit code, 0 or 128 + the signal that ended it.
@@ -229,6 +227,6 @@ def train(settings: Mapping[str, Config], folder: Path, budget: int | None = Non
     if code:
         raise Stopped(code)
     for path in wanted:
-        if not (path / "summary.json").exists():
+        if RunDirectory(path).summary() is None:
             raise UserError(f"{path} is not finished, and not here to be: another process is at it, or none knows it")
     return runs

@@ -49,7 +49,10 @@ def step_flops(layout: JointLayout, schedule: Schedule) -> float:
 def _member(layout: JointLayout, schedule: Schedule, group: Group) -> float:
     """Multiplications of one agent's update, for each transition: see `core.losses`."""
     algorithm, size = group.algorithm, group.action_space.size
-    actor, critic = _actor(group), (update.critic_input_size(layout, group), *group.algorithm.hidden, 1)
+    actor, critic = (
+        _actor(group),
+        (update.critic_input_size(layout, group), *group.algorithm.hidden, group.critic.num_outputs),
+    )
     target_actions = _forward(actor)
     if algorithm.critic == "central":
         target_actions = sum(len(other.members) * _forward(_actor(other)) for other in layout.groups)
@@ -173,7 +176,7 @@ def expectation(training: TrainingSession, done: int = 0) -> str:
         where = "several processes" if training.processes.size > 1 else "an accelerator"
         return f"expected: not estimated for {where}; the first interval shows the rate and the time left"
     group = max(layout.groups, key=lambda g: len(g.members) * _member(layout, schedule, g))
-    critic = (update.critic_input_size(layout, group), *group.algorithm.hidden, 1)
+    critic = (update.critic_input_size(layout, group), *group.algorithm.hidden, group.critic.num_outputs)
     layer = max(pairwise(critic), key=lambda sizes: sizes[0] * sizes[1])
     # Larger products are done at the same rate, and take longer to measure.
     shape = (min(size, 1024) for size in (schedule.batch_size // trainer.devices_per_seed, *layer))

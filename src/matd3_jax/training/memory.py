@@ -46,7 +46,9 @@ def update_bytes(trainer: TrainLoop) -> int:
     layout, schedule = trainer.layout, trainer.schedule
     agents = 1 if trainer.on_cpu else layout.num_agents  # agents updated at the same time
     widest = max(
-        group.algorithm.num_critics * sum(group.algorithm.hidden) + layout.observation_size + layout.action_size
+        group.algorithm.num_critics * (sum(group.algorithm.hidden) + group.critic.num_outputs)
+        + layout.observation_size
+        + layout.action_size
         for group in layout.groups
     )
     rows = layout.num_agents * layout.row_size  # gathered for all agents at once

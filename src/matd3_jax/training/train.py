@@ -9,6 +9,7 @@ import numpy as np
 from matd3_jax import config as configuration
 from matd3_jax.config import Config
 from matd3_jax.config.schema import TEXTS
+from matd3_jax.envs.check import check
 from matd3_jax.envs.environment import Environment
 from matd3_jax.runtime import devices
 from matd3_jax.training.loggers import CallbackLogger, HistoryLogger, Logger
@@ -51,10 +52,13 @@ def train(
         callback: called with every interval's row (columns [seeds]) as it comes.
         loggers: get the same rows, and are closed at the end (see `training.loggers.Logger`).
 
-    Raises UserError for settings that are unknown or impossible.
+    Raises UserError for settings that are unknown or impossible, and for an environment that breaks the contract
+    (`envs.check`).
     """
     devices.prepare()
     own = None if isinstance(env, str) else env
+    if own is not None:
+        check(own)
     given = {key: value for key, value in settings.items() if value is not None or key not in TEXTS}
     chosen = [f"algo={algo}", *(f"{key}={_text(value)}" for key, value in given.items()), *overrides]
     config = configuration.load(chosen if own is not None else [f"env={env}", *chosen])

@@ -1,0 +1,63 @@
+"""Runs and sweeps with the critics that are no default: resumed to the bit, swept, measured by the Q-bias."""
+
+import csv
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from checkpoint_arrays import leaves
+
+from matd3_jax import config
+from matd3_jax.cli import sweep, train
+from matd3_jax.sweep.runner import Sweep
+from matd3_jax.training import checkpoint
+
+TINY = [
+    "env=simple_push", "adversary=maddpg", "seeds=2", "algo.hidden=[8]", "adversary.hidden=[8]", "batch_size=16",
+    "num_envs=2", "learning_starts=200", "replay_capacity=500", "total_steps=600", "log_every=100", "eval_every=300",
+    "eval_episodes=2",
+]  # fmt: skip
+DISTRIBUTION = ["algo.critic_range=[-60,5]", "algo.critic_atoms=9", "adversary.critic_norm=layer"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick(quick_jit):
+    """Every program of this module compiles with little optimization."""
+
+
+def test_resumed_to_the_bit(tmp_path):
+    """A categorical team against one with layer normalization, Q-bias measured on the way."""
+    line = [*TINY, *DISTRIBUTION, "algo.critic_head=categorical", "diagnostics.q_bias=true", f"out={tmp_path}"]
+    assert train.main([*line, "name=whole", "checkpoint_every=300", "keep_checkpoints=3"]) == 0
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    shutil.copytree(whole, cut)
+    first, *later = checkpoint.steps(cut / "checkpoints")
+    for step in later:
+        shutil.rmtree(cut / "checkpoints" / str(step))
+    assert train.main([f"resume={cut}", f"checkpoint={first}"]) == 0
+    assert (cut / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
+    found, want = leaves(cut), leaves(whole)
+    assert found.keys() == want.keys()
+    for name in want:
+        np.testing.assert_array_equal(found[name], want[name], err_msg=name)
+    with (whole / "metrics.csv").open(newline="") as file:
+        last = list(csv.DictReader(file))[-1]
+    # A cross-entropy over 9 atoms starts near ln 9; values are means of returns within the range.
+    assert 0 < float(last["adversary_0_critic_loss"]) and 0 < float(last["agent_0_critic_loss"]) < 3
+    assert -60 < float(last["agent_0_q_value"]) < 5
+
+
+def test_swept(tmp_path: Path):
+    """Each head and each norm is a program of its own, and learns as the same run made alone."""
+    values = ["algo.critic_head=scalar,categorical", "adversary.critic_norm=none,layer"]
+    line = [*TINY, *DISTRIBUTION[:2]]
+    assert sweep.main([*line, *values, f"out={tmp_path}", "name=heads"]) == 0
+    folder = tmp_path / "heads"
+    assert [len(piece) for piece in Sweep(folder).pieces] == [1, 1, 1, 1]
+    assert train.main([*line, "algo.critic_head=categorical", "adversary.critic_norm=layer", f"out={tmp_path}"]) == 0
+    alone = next(path for path in tmp_path.iterdir() if path.name != "heads")
+    (member,) = (folder / "runs").glob("*categorical*layer*")
+    assert (member / "metrics.csv").read_bytes() == (alone / "metrics.csv").read_bytes()
+    settings = config.read(member / "config.yaml")
+    assert settings.algo.critic_head == "categorical" and settings.adversary.critic_norm == "layer"
