@@ -233,6 +233,18 @@ def test_other_settings_and_what_ends_one_end_all():
     assert str(first) == str(third) == "process 1 has ended: ValueError('no such luck')"
 
 
+def test_nothing_is_written_where_one_process_cannot_train(tmp_path, monkeypatch):
+    def check(self):
+        if self.processes.index == 1:
+            raise UserError("no memory here")
+
+    monkeypatch.setattr(TrainingSession, "check_memory", check)
+    settings = config.load([*SEVEN, f"out={tmp_path / 'new'}", "name=run"])
+    (first, second), _ = together(2, lambda processes: train.start(settings, processes))
+    assert str(second) == "no memory here" and str(first) == "process 1 has ended: no memory here"
+    assert not list(tmp_path.iterdir())
+
+
 # ---- a run and a sweep -----------------------------------------------------------------------------------------------
 
 WORKER = """

@@ -52,7 +52,7 @@ def start(settings: Config, processes: Processes) -> int:
     path = Path(settings.out) / (settings.name or _name(settings))
     if processes.first:
         RunDirectory.check_new(path)
-    processes.barrier()  # nothing is written before all processes have found that they can train
+    # The descriptions come from processes that have found that they can train: nothing is written before.
     machine = {"versions": devices.versions(), **processes.description()}
     if processes.first:
         run = RunDirectory.create(path, settings, machine)
