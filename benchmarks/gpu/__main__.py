@@ -1,6 +1,6 @@
 """`python -m benchmarks.gpu`: what a machine with an accelerator should run first: checks, then measurements.
 
-Parts, in this order; docs/performance.md says what each takes:
+Parts, in this order; docs/performance_notes.md says what each takes:
     check       one update against the CPU's, single Ant steps against C MuJoCo, no copy of the replay in the loop
     wall_clock  20 seeds x 60,000 episodes of simple_spread, and their returns beside the CPU's
     floor       the least time of an iteration: its products and bytes at the device's own rates

@@ -8,15 +8,16 @@ from matd3_jax.errors import UserError
 if TYPE_CHECKING:
     from matd3_jax import envs
     from matd3_jax.training.session import TrainingSession
-    from matd3_jax.training.train import Result, train
+    from matd3_jax.training.train import Result, resume, train
 
 __version__ = "0.1.0"
-__all__ = ["Result", "TrainingSession", "UserError", "envs", "train"]
+__all__ = ["Result", "TrainingSession", "UserError", "envs", "resume", "train"]
 
 _MODULES = {
     "Result": "training.train",
     "TrainingSession": "training.session",
     "envs": "envs",
+    "resume": "training.train",
     "train": "training.train",
 }
 """Imported when they are first asked for: a command's --help and what needs no JAX do not wait for it."""

@@ -19,8 +19,9 @@ import pytest
 from matd3_jax import config
 from matd3_jax.cli import command, evaluate, train
 from matd3_jax.errors import UserError
+from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import devices
-from matd3_jax.training import checkpoint
+from matd3_jax.training import announcement, checkpoint, cost
 from matd3_jax.training.session import TrainingSession
 
 # A schedule and networks so small that a run takes a second; every part of the real one is there, two teams included.
@@ -67,7 +68,7 @@ def whole(tmp_path_factory) -> Path:
 
 def test_a_run_leaves_all_its_files(whole):
     assert {p.name for p in whole.iterdir()} == {
-        "config.yaml", "machine.json", "metrics.csv", "checkpoints", "learning_curve.png", "summary.json",
+        "config.yaml", "machine.json", "metrics.csv", "checkpoints", "learning_curve.png", "summary.json", ".lock",
     }  # fmt: skip
     machine = json.loads((whole / "machine.json").read_text())
     assert machine["versions"]["jax"] and machine["devices"]
@@ -120,16 +121,15 @@ def test_evaluations_are_told_of(whole, tmp_path, capsys):
     assert "last_evaluation" not in json.loads((tmp_path / "never" / "summary.json").read_text())
 
 
-def test_the_announcement(tmp_path, monkeypatch, capsys):
+def test_the_announcement(tmp_path, monkeypatch):
     """What a run says before it starts: how long it will take, and for robots alone recipe and engine."""
-    monkeypatch.setattr(train.cost, "product_rate", lambda *_: 1e6)
-    monkeypatch.setattr(train.cost, "physics_rate", lambda *_: None)
+    monkeypatch.setattr(cost, "product_rate", lambda *_: 1e6)
+    monkeypatch.setattr(cost, "physics_rate", lambda *_: None)
 
     def announced(*settings, done=0, recipe=None):
-        training = train.TrainingSession(train.config.load([*settings, "seeds=2", "learning_starts=200"]))
+        training = TrainingSession(config.load([*settings, "seeds=2", "learning_starts=200"]))
         object.__setattr__(training.config, "recipe", recipe)
-        train._announce(training, train.RunDirectory(tmp_path / "run"), done)
-        return capsys.readouterr().out.splitlines()
+        return announcement.first_lines(training, RunDirectory(tmp_path / "run"), done)
 
     lines = announced("env=ant", "env.physics=c", "algo=td3", recipe="fast")
     assert lines[2:4] == ["recipe: fast; for the paper's settings: recipe=paper", "physics: c (C MuJoCo)"]
@@ -148,19 +148,19 @@ def test_the_announcement(tmp_path, monkeypatch, capsys):
 
 def test_stopped_and_resumed_is_the_same_to_the_bit(whole, tmp_path, monkeypatch, capsys):
     """SIGTERM comes in the middle; the resumed run ends in the same table and the same checkpoint, bit for bit."""
-    append = train.RunDirectory.append
+    append = RunDirectory.append
 
     def append_and_signal(self, row):
         append(self, row)
         if int(row["step"][0]) == 750:
             os.kill(os.getpid(), signal.SIGTERM)
 
-    monkeypatch.setattr(train.RunDirectory, "append", append_and_signal)
+    monkeypatch.setattr(RunDirectory, "append", append_and_signal)
     assert run(tmp_path, "name=cut") == 128 + signal.SIGTERM
     monkeypatch.undo()
     cut = tmp_path / "cut"
     assert (
-        f"stopped by SIGTERM at env step 750; go on with: python -m matd3_jax.train resume={cut}"
+        f"stopped by SIGTERM at env step 750; resume with: python -m matd3_jax.train resume={cut}"
         in capsys.readouterr().out
     )
     assert checkpoint.steps(cut / "checkpoints")[-1] == 750
@@ -225,11 +225,11 @@ def test_damage_is_named_and_the_checkpoint_before_it_used_on_request(whole, tmp
     data = bytearray(victim.read_bytes())
     data[len(data) // 2] ^= 1
     victim.write_bytes(data)
-    before = {p: p.stat().st_mtime_ns for p in damaged.rglob("*")}
+    before = {p: p.stat().st_mtime_ns for p in damaged.rglob("*") if p.name != ".lock"}
     with pytest.raises(UserError) as error:
         train.main([f"resume={damaged}", "total_steps=2000"])
     assert victim.name in str(error.value) and f"checkpoint={found[-2]}" in str(error.value)
-    assert before == {p: p.stat().st_mtime_ns for p in damaged.rglob("*")}
+    assert before == {p: p.stat().st_mtime_ns for p in damaged.rglob("*") if p.name != ".lock"}
     assert train.main([f"resume={damaged}", f"checkpoint={found[-2]}"]) == 0
     assert (damaged / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
 
@@ -320,11 +320,11 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_bad_input_to_train_writes_nothing(case, whole, monkeypatch):
     arguments, wanted = BAD[case]
-    before = {p: p.stat().st_mtime_ns for p in whole.parent.rglob("*")}
+    before = {p: p.stat().st_mtime_ns for p in whole.parent.rglob("*") if p.name != ".lock"}
     tiny = [] if any(a.startswith("resume") for a in arguments) else [*TINY, f"out={whole.parent}"]
     with pytest.raises(UserError, match=wanted.replace("(", r"\(")):
         train.main([*tiny, *(a.format(whole=whole) for a in arguments)])
-    assert before == {p: p.stat().st_mtime_ns for p in whole.parent.rglob("*")}
+    assert before == {p: p.stat().st_mtime_ns for p in whole.parent.rglob("*") if p.name != ".lock"}
 
 
 CANNOT = {

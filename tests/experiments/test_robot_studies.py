@@ -73,7 +73,7 @@ def test_recipe():
 
 def test_critics():
     """Each kind is compared with the recipe's critics on the same robot."""
-    levels = {label: 1000.0 for label in critics.settings("paper", {})}
+    levels = {label: 1000.0 for label in critics.settings("paper", StudyOptions())}
     levels |= {"half_cheetah-as_they_are": 2000.0, "half_cheetah-categorical": 2500.0, "ant-both": 700.0}
     found = words(critics.claims(table_of(critics, levels)))
     assert found == ["not shown", "not shown", "opposite", "opposite", "same", "opposite"]

@@ -41,7 +41,7 @@ def test_a_second_process_is_told_who_works_there_and_a_killed_one_is_taken_over
         os.kill(other.pid, signal.SIGKILL)
         other.wait()
         with lock.held(tmp_path):
-            assert json.loads((tmp_path / "lock").read_text())["process"] == os.getpid()
+            assert json.loads((tmp_path / ".lock").read_text())["process"] == os.getpid()
     finally:
         other.kill()
 
@@ -54,17 +54,17 @@ def test_it_can_be_held_again_after_its_end_and_after_an_error(tmp_path, kind):
 
 def test_an_owner_on_another_host_is_not_declared_dead(tmp_path, monkeypatch):
     monkeypatch.setattr(lock, "fcntl", None)
-    (tmp_path / "lock").write_text(json.dumps({"process": 2**22 - 3, "host": "elsewhere"}))
+    (tmp_path / ".lock").write_text(json.dumps({"process": 2**22 - 3, "host": "elsewhere"}))
     with pytest.raises(UserError, match="on elsewhere works in it"), lock.held(tmp_path):
         pass
-    (tmp_path / "lock").write_text("torn {")
+    (tmp_path / ".lock").write_text("torn {")
     with pytest.raises(UserError, match="another process works in it"), lock.held(tmp_path):
         pass
 
 
 def test_a_lock_that_is_a_link_is_not_followed(tmp_path):
     (tmp_path / "mine").write_text("mine")
-    (tmp_path / "lock").symlink_to(tmp_path / "mine")
+    (tmp_path / ".lock").symlink_to(tmp_path / "mine")
     with pytest.raises(UserError, match="is a link"), lock.held(tmp_path):
         pass
     assert (tmp_path / "mine").read_text() == "mine"

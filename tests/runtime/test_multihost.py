@@ -27,6 +27,7 @@ from matd3_jax.runtime import multihost, slurm
 from matd3_jax.runtime.multihost import Processes
 from matd3_jax.sweep import runner
 from matd3_jax.training import checkpoint
+from matd3_jax.training.recording import Recorder
 from matd3_jax.training.session import TrainingSession
 
 # A point mass, with evaluations and a ring that comes round on the way.
@@ -239,8 +240,8 @@ def test_nothing_is_written_where_one_process_cannot_train(tmp_path, monkeypatch
             raise UserError("no memory here")
 
     monkeypatch.setattr(TrainingSession, "check_memory", check)
-    settings = config.load([*SEVEN, f"out={tmp_path / 'new'}", "name=run"])
-    (first, second), _ = together(2, lambda processes: train.start(settings, processes))
+    settings = config.load(SEVEN)
+    (first, second), _ = together(2, lambda processes: Recorder(processes).start(settings, tmp_path / "new" / "run"))
     assert str(second) == "no memory here" and str(first) == "process 1 has ended: no memory here"
     assert not list(tmp_path.iterdir())
 
@@ -314,7 +315,7 @@ def test_two_processes_make_the_run_of_one(alone, tmp_path, quickly_compiled):
             worker.kill()
     assert [worker.returncode for worker in workers] == [128 + signal.SIGTERM] * 2, said
     run = tmp_path / "run"
-    assert f"stopped by SIGTERM at env step 500; go on with: python -m matd3_jax.train resume={run}" in said[0]
+    assert f"stopped by SIGTERM at env step 500; resume with: python -m matd3_jax.train resume={run}" in said[0]
     assert "run directory" not in said[1] and "%" not in said[1]
     machine = json.loads((run / "machine.json").read_text())
     assert [len(process["devices"]) for process in machine["processes"]] == [3, 1]

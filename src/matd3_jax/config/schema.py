@@ -145,6 +145,7 @@ class Config:
     eval_episodes: int = setting(BOOKKEEPING, splits=True, reported=True, least=1, before=10)
     diagnostics: DiagnosticsConfig = setting(BOOKKEEPING, splits=True, reported=True)
     checkpoint_every: int | None = setting(BOOKKEEPING, least=0)
+    checkpoint_minutes: float = setting(BOOKKEEPING, least=0, before=10.0)
     keep_checkpoints: int = setting(BOOKKEEPING, least=1)
     tensorboard: bool = setting(BOOKKEEPING)
 

@@ -62,20 +62,19 @@ def check(config: "Config") -> None:
 def _check_team(name: str, team: "AlgoConfig", updates: int, need: Any) -> None:
     _check_bounds(f"{name}.", team)
     need(
-        team.critic_head != "categorical" or team.critic_range is not None,
-        f"{name}.critic_head=categorical needs the range of returns: {name}.critic_range=[low,high]",
-    )
-    if team.critic_range is not None:
-        first, last = team.critic_range
-        text = f"{name}.critic_range={list(team.critic_range)}"
-        need(first < last, f"{text}: the first number must be below the second")
-    need(
         updates % team.policy_delay == 0 or team.policy_delay % updates == 0,
         f"updates_per_collect={updates} is not a multiple of {name}.policy_delay={team.policy_delay} (nor divides it)",
     )
     if isinstance(team.exploration_noise, tuple):
         low, high = team.exploration_noise
         need(low <= high, f"{name}.exploration_noise=[{low},{high}]: a range [low,high] must not end below its start")
+    need(
+        team.critic_head != "categorical" or team.critic_range is not None,
+        f"{name}.critic_head=categorical needs the range of returns: {name}.critic_range=[low,high]",
+    )
+    if team.critic_range is not None:
+        first, last = team.critic_range
+        need(first < last, f"{name}.critic_range=[{first},{last}]: the first number must be below the second")
 
 
 def _check_bounds(prefix: str, part: Any) -> None:

@@ -15,7 +15,7 @@ try:
 except ImportError:  # not on every system
     fcntl = None  # type: ignore[assignment]
 
-NAME = "lock"
+NAME = ".lock"
 
 
 @contextlib.contextmanager

@@ -1,18 +1,26 @@
-"""SIGINT and SIGTERM as a wish to stop soon."""
+"""SIGINT, SIGTERM and SIGHUP as a wish to stop soon."""
 
 import signal
 import sys
+import threading
 
 from matd3_jax.runtime.multihost import Processes
+from matd3_jax.runtime.terminal import say
+
+NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
 
 
 class Stop:
-    """SIGINT and SIGTERM end the run after the interval at work; a second one ends it at once."""
+    """The signals end the run after the interval at work; a second one ends it at once."""
 
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._remember)
+        self._came = threading.Event()
+        # A handler runs between any two operations, in the middle of a print, too: it only notes what came.
+        threading.Thread(target=self._tell, daemon=True).start()
+        for name in NAMES:
+            if hasattr(signal, name):
+                signal.signal(getattr(signal, name), self._remember)
 
     def agreed(self, processes: Processes) -> signal.Signals | None:
         """The signal that has come to any of the processes, if any has; all get the same answer."""
@@ -23,4 +31,9 @@ class Stop:
         if self.signal is not None:
             sys.exit(128 + number)
         self.signal = signal.Signals(number)
-        print(f"\n{self.signal.name}: writing a checkpoint after this interval (again: stop at once)", flush=True)
+        self._came.set()
+
+    def _tell(self) -> None:
+        self._came.wait()
+        assert self.signal is not None
+        say(f"\n{self.signal.name}: writing a checkpoint after this interval (again: stop at once)")

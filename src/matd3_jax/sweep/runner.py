@@ -17,14 +17,12 @@ import numpy as np
 
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError
-from matd3_jax.figures import learning_curves, q_bias
-from matd3_jax.runs import overestimation, summary
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import devices, files
 from matd3_jax.runtime.multihost import ALONE, Processes
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.sweep import batching
-from matd3_jax.training import checkpoint
+from matd3_jax.training import checkpoint, finish
 from matd3_jax.training import run as training_run
 from matd3_jax.training.loggers import Logger, TableLogger, TensorBoardLogger
 from matd3_jax.training.loop import TrainState
@@ -186,13 +184,7 @@ class Piece:
             checkpoint.save(run.checkpoints, int(row["step"][0]), trainer, state, keep=1, seeds=seeds, share=share)
             if not self.processes.first:
                 continue
-            metrics = run.read_metrics()
-            learning_curves.learning_curve(run.curve, metrics, str(config.name))
-            whole = summary.summary(metrics, {n: values[seeds] for n, values in row.items()}, **facts)
-            if config.diagnostics.q_bias:
-                whole["overestimation"] = overestimation.summary(metrics, self.training.layout.agents)
-                q_bias.draw(run.q_bias, metrics, self.training.layout.by_team(), str(config.name))
-            run.write_summary(whole)
+            finish.finish(run, self.training.layout, str(config.name), config.diagnostics.q_bias, facts)
 
     def _announce(self) -> None:
         training, config = self.training, self.members[0]

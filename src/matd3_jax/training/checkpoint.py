@@ -11,6 +11,7 @@ import glob
 import hashlib
 import json
 import logging
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -24,11 +25,15 @@ import orbax.checkpoint as ocp
 
 from matd3_jax.core import replay
 from matd3_jax.errors import UserError
+from matd3_jax.runtime import files
 from matd3_jax.runtime.multihost import ALONE, Share
 from matd3_jax.training.loop import TrainLoop, TrainState
 
 RENAMED = ((".rollouts", ".collects"), ("_optimizer", "_optimiser"))
 """Parts of leaves' paths, and what checkpoints from before have in their place."""
+
+ASIDE = ".set_aside"
+"""At the end of the names of checkpoints that a run no longer leads to."""
 
 logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax tells of every step at INFO and warns of its own defaults.
 
@@ -66,19 +71,38 @@ def save(
                 written[0] /= str(first - wanted.start)
             own = slice(first - share.first, last - share.first)
             checkpointer.save(there / written[0].relative_to(partial_), _leaves(trainer, state, own))
+        if seeds is None and processes.first:
+            (partial_ / "replay").mkdir(exist_ok=True)  # there even before the first row
         for seed, rows in _replay_rows(trainer, state) if seeds is None else ():
+            if not rows.size:
+                continue  # Orbax does not write what has no numbers
             written.append(partial_ / "replay" / str(share.first + seed))
             checkpointer.save(there / written[-1].relative_to(partial_), {"rows": rows})
             checkpointer.wait_until_finished()
     parts = processes.collect(json.dumps(_checksums(partial_, written)).encode())
     if processes.first:
         checksums = dict(sorted(pair for part in parts for pair in json.loads(part).items()))
-        (partial_ / "checksums.json").write_text(json.dumps(checksums, indent=1))
+        files.write_json(partial_ / "checksums.json", checksums)
         shutil.rmtree(final, ignore_errors=True)
         partial_.rename(final)
+        files.sync_folder(folder)
         for old in steps(folder)[:-keep]:
             shutil.rmtree(folder / str(old))
+        for aside in folder.glob(f"*{ASIDE}"):
+            shutil.rmtree(aside, ignore_errors=True)
     return final
+
+
+def set_aside_after(folder: Path, step: int) -> None:
+    """Rename the checkpoints after env step `step`, which the run is resumed from: it is going to have others there.
+
+    They are kept until the next checkpoint is written.
+    """
+    for later in steps(folder):
+        if later > step:
+            aside = folder / f"{later}{ASIDE}"
+            shutil.rmtree(aside, ignore_errors=True)
+            (folder / str(later)).rename(aside)
 
 
 @contextlib.contextmanager
@@ -114,6 +138,8 @@ def verify(folder: Path, step: int | None = None) -> Path:
     try:
         wanted = json.loads((path / "checksums.json").read_text())
         damaged = next((name for name, digest in wanted.items() if _digest(path / name) != digest), None)
+    except FileNotFoundError as error:
+        damaged = f"{Path(str(error.filename)).relative_to(path)} is missing"
     except (OSError, ValueError, AttributeError):
         damaged = "checksums.json"
     if damaged is not None:
@@ -140,6 +166,8 @@ def restore(path: Path, trainer: TrainLoop, share: Share | None = None) -> Train
             shape = (len(seeds), trainer.schedule.replay_capacity, trainer.layout.row_size)
             rows = jax.device_put(jnp.zeros(shape, jnp.float32, device=device), device)
             for place, seed in enumerate(seeds):
+                if not filled:
+                    continue
                 one = np.asarray(checkpointer.restore(path / "replay" / str(share.first + seed))["rows"])
                 if one.shape[0] > shape[1] or one.shape[0] < filled or one.shape[1] != shape[2]:
                     raise UserError(f"{path}: a replay of shape {one.shape} does not fit these settings")
@@ -197,6 +225,7 @@ def _leaves(trainer: TrainLoop, state: TrainState, seeds: slice) -> dict[str, np
     plain = state._replace(replay=None, key=jax.random.key_data(state.key))  # type: ignore[arg-type]
     found = jax.tree_util.tree_flatten_with_path(plain)[0]
     whole = {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in found}
+    whole = {name: leaf for name, leaf in whole.items() if leaf.size}  # Orbax does not write what has no numbers
     return {name: leaf[: trainer.num_seeds][seeds] if leaf.ndim else leaf for name, leaf in whole.items()}
 
 
@@ -211,8 +240,9 @@ def _rebuild(trainer: TrainLoop, path: Path, share: Share) -> TrainState:
         now = before = jax.tree_util.keystr(name)
         for new, old in RENAMED:
             before = before.replace(new, old)
-        value = saved.get(now, saved.get(before, np.array(np.nan)))
         wanted = (trainer.num_seeds, *leaf.shape[1:]) if leaf.ndim else ()
+        nothing = np.zeros(wanted, leaf.dtype) if 0 in wanted else np.array(np.nan)  # without numbers: not written
+        value = saved.get(now, saved.get(before, nothing))
         if value.shape != wanted or value.dtype != leaf.dtype:
             raise UserError(f"{path}: {jax.tree_util.keystr(name)} does not fit these settings")
         leaves.append(value if not leaf.ndim else np.asarray(trainer.fill(value)))
@@ -225,10 +255,13 @@ def _rebuild(trainer: TrainLoop, path: Path, share: Share) -> TrainState:
 
 def _checksums(path: Path, folders: Sequence[Path]) -> dict[str, str]:
     """Digests of all files in `folders`, by their names from `path` on."""
-    files = (file for folder in folders for file in folder.rglob("*") if file.is_file())
-    return {str(file.relative_to(path)): _digest(file) for file in files}
+    found = (file for folder in folders for file in folder.rglob("*") if file.is_file())
+    return {str(file.relative_to(path)): _digest(file, sync=True) for file in found}
 
 
-def _digest(path: Path) -> str:
+def _digest(path: Path, sync: bool = False) -> str:
+    """sync: bring the file to the disk, too, before anything is renamed."""
     with path.open("rb") as file:
+        if sync:
+            os.fsync(file.fileno())
         return hashlib.file_digest(file, "sha256").hexdigest()

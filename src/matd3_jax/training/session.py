@@ -168,6 +168,11 @@ class TrainingSession:
         """Env steps of each seed so far."""
         return self.trainer.env_steps(int(state.rollouts))
 
+    def logged_steps(self, step: int) -> list[int]:
+        """The env steps up to `step` at which the metrics table has rows: after the warm-up and each interval."""
+        first, interval = self.trainer.warmup_steps, self.iterations_per_interval * self.trainer.iteration_steps
+        return list(range(first, step + 1, interval))
+
     def row(self, state: TrainState, metrics: Metrics) -> Row:
         """The interval's row of the metrics table for each seed."""
         seeds = len(self.seeds)

@@ -1,7 +1,8 @@
-"""`matd3_jax.train`: a run from Python."""
+"""`matd3_jax.train` and `matd3_jax.resume`: runs from Python."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,13 +15,14 @@ from matd3_jax.envs.environment import Environment
 from matd3_jax.runtime import devices
 from matd3_jax.training.loggers import CallbackLogger, HistoryLogger, Logger
 from matd3_jax.training.loop import TrainState
+from matd3_jax.training.recording import Recorded, Recorder
 from matd3_jax.training.run import run
 from matd3_jax.training.session import Row, TrainingSession
 
 
 @dataclasses.dataclass
 class Result:
-    """What `train` returns."""
+    """What `train` and `resume` return."""
 
     config: Config
     training: TrainingSession
@@ -28,6 +30,8 @@ class Result:
     """Everything trained, leading axis [seeds] (see `loop.TrainState`)."""
     metrics: dict[str, np.ndarray]
     """Columns of the metrics table, each [seeds, intervals]; "step" is env steps of each seed."""
+    run_dir: Path | None = None
+    """Where the run has its files, if it has."""
 
     def evaluate(self, episodes: int = 100, deterministic: bool = True, seed: int = 0) -> np.ndarray:
         """Undiscounted returns [seeds, episodes, agents] of whole episodes (see `TrainingSession.evaluate`)."""
@@ -38,6 +42,7 @@ def train(
     *overrides: str,
     env: str | Environment = "simple_spread",
     algo: str = "matd3",
+    run_dir: str | Path | None = None,
     callback: Callable[[Row], None] | None = None,
     loggers: Sequence[Logger] = (),
     **settings: Any,
@@ -45,15 +50,24 @@ def train(
     """Train `seeds` runs side by side and return their states and metrics.
 
     Takes what the command line takes: `train(env="simple_tag", algo="matd3", adversary="maddpg", seeds=8)`, and
-    single values as strings: `train("algo.lr=0.003", "env.num_good=2", ...)`. Writes no files.
+    single values as strings: `train("algo.lr=0.003", "env.num_good=2", ...)`.
 
     Args:
         env: a name, or an `Environment` of your own.
+        run_dir: a directory to be made, with everything that the command leaves in one: settings, metrics, checkpoints,
+            figures, summary; `resume` trains the run on. None: no files are written.
         callback: called with every interval's row (columns [seeds]) as it comes.
         loggers: get the same rows, and are closed at the end (see `training.loggers.Logger`).
 
     Raises UserError for settings that are unknown or impossible, and for an environment that breaks the contract
     (`envs.check`).
+
+    Example:
+        >>> import matd3_jax
+        >>> tiny = dict(total_steps=400, learning_starts=200, batch_size=16, num_envs=2, rollout_length=5)
+        >>> result = matd3_jax.train(env="point_reach", seeds=2, replay_capacity=400, **tiny)
+        >>> result.metrics["step"].shape[0], result.evaluate(episodes=3).shape
+        (2, (2, 3, 2))
     """
     devices.prepare()
     own = None if isinstance(env, str) else env
@@ -64,14 +78,51 @@ def train(
     config = configuration.load(chosen if own is not None else [f"env={env}", *chosen])
     if own is not None:
         config = dataclasses.replace(config, env={"name": type(own).__name__})
+    every = [*loggers, *([] if callback is None else [CallbackLogger(callback)])]
+    if run_dir is not None:
+        return _result(Recorder(loggers=every).start(config, Path(run_dir), own))
     training = TrainingSession(config, own)
     state, row = training.start()
     history = HistoryLogger(row)
-    every = [history, *loggers, *([] if callback is None else [CallbackLogger(callback)])]
-    for logger in every[1:]:
+    for logger in every:
         logger.log(row)
-    outcome = run(training, state, row, every)
+    outcome = run(training, state, row, [history, *every])
     return Result(config, training, outcome.state, stack(history.rows))
+
+
+def resume(
+    run_dir: str | Path,
+    *,
+    checkpoint: int | None = None,
+    total_steps: int | None = None,
+    env: Environment | None = None,
+    callback: Callable[[Row], None] | None = None,
+    loggers: Sequence[Logger] = (),
+) -> Result:
+    """Train a run on from its last checkpoint, as if it had never been stopped, and return its state and metrics.
+
+    Args:
+        run_dir: the run's directory, made by `train(run_dir=...)` or by the command.
+        checkpoint: the env step of an older checkpoint to resume from.
+        total_steps: env steps of each seed from now on; None: as before.
+        env: the environment of a run that was given one as an object.
+        callback, loggers: get the rows to come (see `train`).
+
+    Raises UserError where there is no run, it has come to its end, or the checkpoint is damaged.
+    """
+    devices.prepare()
+    if env is not None:
+        check(env)
+    every = [*loggers, *([] if callback is None else [CallbackLogger(callback)])]
+    return _result(Recorder(loggers=every).resume(Path(run_dir), checkpoint, total_steps, env))
+
+
+def _result(recorded: Recorded) -> Result:
+    table = recorded.directory.read_metrics()
+    seeds = np.unique(table["seed"])
+    columns = {name: np.stack([column[table["seed"] == seed] for seed in seeds]) for name, column in table.items()}
+    training = recorded.training
+    return Result(training.config, training, recorded.outcome.state, columns, recorded.directory.path)
 
 
 def stack(rows: list[Row]) -> dict[str, np.ndarray]:

@@ -1,0 +1,219 @@
+"""A run that leaves a directory: started, resumed from whatever a stop or a kill left, finished."""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from matd3_jax import config
+from matd3_jax.config import Config
+from matd3_jax.envs.environment import Environment
+from matd3_jax.errors import UserError
+from matd3_jax.runs import lock
+from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.runtime import devices
+from matd3_jax.runtime.multihost import ALONE, Processes
+from matd3_jax.runtime.signals import Stop
+from matd3_jax.training import announcement, checkpoint, finish
+from matd3_jax.training.loggers import Logger, TableLogger, TensorBoardLogger
+from matd3_jax.training.loop import TrainState
+from matd3_jax.training.progress import ProgressBar
+from matd3_jax.training.run import Outcome, run
+from matd3_jax.training.session import Row, TrainingSession
+
+Say = Callable[[str], None]
+
+
+class Recorded(NamedTuple):
+    """A run when it is left."""
+
+    directory: RunDirectory
+    training: TrainingSession
+    outcome: Outcome
+
+
+class Recorder:
+    """Trains runs whose directories hold their settings, metrics, checkpoints and figures.
+
+    Args:
+        processes: which train together; the first alone writes and speaks.
+        heed_signals: whether SIGINT, SIGTERM and SIGHUP end a run after a checkpoint (of a program of its own), or
+            stay with the program that calls.
+        say: gets the lines about a run; None: nothing is said, nor a progress bar shown.
+        loggers: get the rows of the metrics table, too.
+    """
+
+    def __init__(
+        self,
+        processes: Processes = ALONE,
+        heed_signals: bool = False,
+        say: Say | None = None,
+        loggers: Sequence[Logger] = (),
+    ):
+        self.processes, self.loggers = processes, loggers
+        self.heed_signals = heed_signals
+        self.say: Say = say if say is not None and processes.first else lambda line: None
+        self.shows_progress = say is not None
+
+    def start(self, settings: Config, path: Path, env: Environment | None = None) -> Recorded:
+        """Train a fresh run in the directory `path`, which is made.
+
+        Raises UserError where the run is impossible, before anything is written.
+        """
+        training = self._checked(settings, env)
+        if self.processes.first:
+            RunDirectory.check_new(path)
+        self.processes.barrier()  # nothing is written before all processes have found that they can train
+        stop = self._stop()
+        machine = {"versions": devices.versions(), **self.processes.description()}
+        if self.processes.first:
+            RunDirectory.create(path, settings, machine)
+        directory = RunDirectory(self.processes.same_directory(path))
+        with self._held(directory):
+            return self._from_the_start(training, directory, stop)
+
+    def resume(
+        self, path: Path, step: int | None = None, total_steps: int | None = None, env: Environment | None = None
+    ) -> Recorded:
+        """Train a run on from its last checkpoint, or from that of env step `step`; from the start where it has none.
+
+        A run that was left between its last checkpoint and its summary is finished.
+
+        Args:
+            total_steps: env steps of each seed from now on; None: as before.
+            env: of a run whose environment was given as an object.
+
+        Raises UserError where there is no run, it has come to its end, or the checkpoint is damaged.
+        """
+        directory, settings = RunDirectory.open(path)
+        if total_steps is not None:
+            settings = config.from_dict({**settings.to_dict(), "total_steps": total_steps})
+        with self._held(directory):
+            training = self._checked(settings, env)
+            stop = self._stop()
+            there = bool(checkpoint.steps(directory.checkpoints)) if self.processes.first else None
+            if not self.processes.tell(there) and step is None:
+                self.say("no checkpoint yet: this run starts anew")
+                if self.processes.first:
+                    directory.clear()
+                return self._from_the_start(training, directory, stop)
+            saved = Path(
+                self.processes.tell(
+                    str(checkpoint.verify(directory.checkpoints, step)) if self.processes.first else None
+                )
+            )
+            return self._from_checkpoint(training, directory, saved, stop)
+
+    def _checked(self, settings: Config, env: Environment | None) -> TrainingSession:
+        training = TrainingSession(settings, env, processes=self.processes)
+        training.check_memory()
+        if settings.tensorboard:
+            TensorBoardLogger.check()
+        return training
+
+    def _stop(self) -> Stop | None:
+        return Stop() if self.heed_signals else None
+
+    @contextlib.contextmanager
+    def _held(self, directory: RunDirectory) -> Iterator[None]:
+        """The directory's lock, which the first process holds for all."""
+        with lock.held(directory.path) if self.processes.first else contextlib.nullcontext():
+            yield
+
+    def _from_the_start(self, training: TrainingSession, directory: RunDirectory, stop: Stop | None) -> Recorded:
+        for line in announcement.first_lines(training, directory) if self.processes.first else ():
+            self.say(line)
+        state, row = training.start()
+        if self.processes.first:
+            directory.append(row)
+            for logger in self.loggers:
+                logger.log(row)
+        return self._to_the_end(training, directory, state, row, stop, fresh=True)
+
+    def _from_checkpoint(
+        self, training: TrainingSession, directory: RunDirectory, saved: Path, stop: Stop | None
+    ) -> Recorded:
+        done = int(saved.name)
+        row = {"step": np.array([done])}
+        if done >= training.total_steps:
+            if self.processes.tell(directory.summary() is not None if self.processes.first else None):
+                raise UserError(
+                    f"{directory.path} is at env step {done:,} of {training.total_steps:,}: to train on, raise "
+                    "total_steps="
+                )
+            state = checkpoint.restore(saved, training.trainer, training.share)
+            if self.processes.first:
+                self.say(f"{directory.path} has come to its end; its figures and its summary are made")
+                self._notes(training, directory, done)
+                self._finish(training, directory, {})
+            return Recorded(directory, training, Outcome(state, row, None))
+        if self.processes.first:
+            for line in announcement.first_lines(training, directory, done):
+                self.say(line)
+            self.say(f"resumed from the checkpoint of env step {done:,}")
+        state = checkpoint.restore(saved, training.trainer, training.share)
+        self.processes.barrier()  # the files are changed only when all have what they need
+        if self.processes.first:
+            checkpoint.set_aside_after(directory.checkpoints, done)
+            config.write(training.config, directory.path / "config.yaml")
+            self._notes(training, directory, done)
+        row["updates"] = np.array([training.trainer.updates(int(state.rollouts))])
+        return self._to_the_end(training, directory, state, row, stop)
+
+    def _notes(self, training: TrainingSession, directory: RunDirectory, done: int) -> None:
+        """Take the rows after env step `done` out of the metrics table, and say what it lacks."""
+        table = directory.cut(done)
+        if table.damaged:
+            plural = "s" * (table.damaged > 1)
+            self.say(f"note: {directory.metrics} had {table.damaged} damaged line{plural}, left out now")
+        missing = table.missing(training.logged_steps(done), training.share.total)
+        if missing:
+            shown = ", ".join(f"{step:,}" for step in missing[:5]) + (", ..." if len(missing) > 5 else "")
+            self.say(f"note: {directory.metrics} lacks the rows of {len(missing)} logging intervals: env steps {shown}")
+
+    def _to_the_end(
+        self,
+        training: TrainingSession,
+        directory: RunDirectory,
+        state: TrainState,
+        row: Row,
+        stop: Stop | None,
+        fresh: bool = False,
+    ) -> Recorded:
+        """Train to the end, or until a signal comes."""
+        settings, begun = training.config, time.monotonic()
+        loggers: list[Logger] = []
+        progress = None
+        if self.processes.first:
+            loggers = [TableLogger([directory])]
+            if self.shows_progress:
+                progress = ProgressBar(training, row)
+                loggers.append(progress)
+            if settings.tensorboard:
+                loggers.append(TensorBoardLogger([directory]))
+            loggers += self.loggers
+
+        def save(state: TrainState, step: int) -> None:
+            keep = settings.keep_checkpoints
+            checkpoint.save(directory.checkpoints, step, training.trainer, state, keep, share=training.share)
+
+        outcome = run(training, state, row, loggers, save, stop, save_first=fresh)
+        step = int(outcome.row["step"][0])
+        save(outcome.state, step)
+        if self.processes.first:
+            if outcome.stopped is None:
+                rates = {} if progress is None else progress.rates()
+                self._finish(training, directory, {"seconds": round(time.monotonic() - begun, 1), **rates})
+            else:
+                title = announcement.title(training)
+                finish.draw(directory, training.layout, title, settings.diagnostics.q_bias)
+        return Recorded(directory, training, outcome)
+
+    def _finish(self, training: TrainingSession, directory: RunDirectory, facts: dict) -> None:
+        title = announcement.title(training)
+        found = finish.finish(directory, training.layout, title, training.config.diagnostics.q_bias, facts)
+        for line in announcement.last_lines(training, directory, found):
+            self.say(line)
