@@ -59,6 +59,7 @@ def test_programs_are_split_by_shapes_and_by_what_their_interval_does():
         "name": "a",
         "out": "b",
         "checkpoint_every": 1,
+        "checkpoint_minutes": 3.0,
         "keep_checkpoints": 9,
         "tensorboard": True,
     }
@@ -71,7 +72,7 @@ def test_programs_are_split_by_shapes_and_by_what_their_interval_does():
 def test_lists_that_follow_from_the_fields():
     assert set(schema.RECORDS) == {
         "total_steps", "name", "out", "log_every", "eval_every", "eval_episodes", "diagnostics", "checkpoint_every",
-        "keep_checkpoints", "tensorboard",
+        "checkpoint_minutes", "keep_checkpoints", "tensorboard",
     }  # fmt: skip
     # What a table says of a seed depends on how long the run was and how it was evaluated.
     reported = {"total_steps", "eval_every", "eval_episodes", "diagnostics"}
