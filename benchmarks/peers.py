@@ -39,7 +39,10 @@ class Options(Reported):
     turns: int = option("in each of which every way to do the work is measured", default=3, least=1)
     seconds: float = option("for each measurement", default=2.0, unit="seconds", above=0)
     only: tuple[str, ...] = option(
-        "peers", default=tuple(rows.groups(1)), choices=tuple(rows.groups(1)), metavar="[NAME,NAME,...]"
+        "which peers to measure",
+        default=tuple(rows.groups(1)),
+        choices=tuple(rows.groups(1)),
+        metavar="[NAME,NAME,...]",
     )
     envs: Path | None = option(
         "where the peers' virtual environments are", default=None, otherwise="matd3_jax/peers in the cache folder"

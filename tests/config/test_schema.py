@@ -24,6 +24,10 @@ OTHER = {  # another value of each setting of an algorithm
     "actor_output": "tanh",
     "target_noise": 0.3,
     "sync_targets": False,
+    "critic_norm": "layer",
+    "critic_head": "categorical",
+    "critic_atoms": 11,
+    "critic_range": (-1.0, 2.0),
 }
 
 
@@ -55,6 +59,7 @@ def test_programs_are_split_by_shapes_and_by_what_their_interval_does():
         "name": "a",
         "out": "b",
         "checkpoint_every": 1,
+        "checkpoint_minutes": 3.0,
         "keep_checkpoints": 9,
         "tensorboard": True,
     }
@@ -67,7 +72,7 @@ def test_programs_are_split_by_shapes_and_by_what_their_interval_does():
 def test_lists_that_follow_from_the_fields():
     assert set(schema.RECORDS) == {
         "total_steps", "name", "out", "log_every", "eval_every", "eval_episodes", "diagnostics", "checkpoint_every",
-        "keep_checkpoints", "tensorboard",
+        "checkpoint_minutes", "keep_checkpoints", "tensorboard",
     }  # fmt: skip
     # What a table says of a seed depends on how long the run was and how it was evaluated.
     reported = {"total_steps", "eval_every", "eval_episodes", "diagnostics"}
@@ -98,6 +103,7 @@ def test_texts_are_taken_as_they_are_typed(text, tmp_path):
         ("algo.hidden=[8,0]", r"^algo.hidden=\[8, 0\]: each must be at least 1$"),
         ("algo.exploration_noise=[0.4,0.1]", "must not end below its start"),
         ("algo.exploration_noise=[-0.1,0.1]", "must not be negative"),
+        ("algo.critic_range=[-1,inf]", r"^algo.critic_range=\[-1.0, inf\]: each must be finite$"),
         ("algo.exploration_noise=inf", "must not be negative"),
         ("seed=3000000000", "^seed=3000000000: must lie between 0 and 2147483647$"),
         ("resum=a", "did you mean"),

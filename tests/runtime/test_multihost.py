@@ -27,6 +27,7 @@ from matd3_jax.runtime import multihost, slurm
 from matd3_jax.runtime.multihost import Processes
 from matd3_jax.sweep import runner
 from matd3_jax.training import checkpoint
+from matd3_jax.training.recording import Recorder
 from matd3_jax.training.session import TrainingSession
 
 # A point mass, with evaluations and a ring that comes round on the way.
@@ -233,6 +234,18 @@ def test_other_settings_and_what_ends_one_end_all():
     (first, second, third), _ = together(3, fail)
     assert isinstance(second, ValueError)
     assert str(first) == str(third) == "process 1 has ended: ValueError('no such luck')"
+
+
+def test_nothing_is_written_where_one_process_cannot_train(tmp_path, monkeypatch):
+    def check(self):
+        if self.processes.index == 1:
+            raise UserError("no memory here")
+
+    monkeypatch.setattr(TrainingSession, "check_memory", check)
+    settings = config.load(SEVEN)
+    (first, second), _ = together(2, lambda processes: Recorder(processes).start(settings, tmp_path / "new" / "run"))
+    assert str(second) == "no memory here" and str(first) == "process 1 has ended: no memory here"
+    assert not list(tmp_path.iterdir())
 
 
 # ---- a run and a sweep -----------------------------------------------------------------------------------------------

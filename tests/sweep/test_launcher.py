@@ -17,7 +17,7 @@ from matd3_jax.sweep import launcher
     ],
 )  # fmt: skip
 def test_a_job_gets_the_path_as_it_is(text):
-    override = OverridesParser.create().parse_override(f"sweep={launcher._quoted(Path(text))}")
+    override = OverridesParser.create().parse_override(f"sweep={launcher.quoted(Path(text))}")
     settings = OmegaConf.create({"sweep": ""})
     OmegaConf.update(settings, "sweep", override.value())
     assert settings.sweep == text

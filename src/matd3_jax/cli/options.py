@@ -184,7 +184,7 @@ def _read(name: str, texts: Sequence[str], hint: Any, meta: typing.Mapping[str, 
     if len(texts) > 1:
         raise UserError(f"{name}= is given {len(texts)} times: {', '.join(texts)}")
     kinds = _kinds(hint)
-    if type(None) in kinds and texts[0] in ("null", "None") and not {str, Path} & set(kinds):
+    if type(None) in kinds and texts[0] == "null" and not {str, Path} & set(kinds):
         return None
     kind = kinds[0]
     if typing.get_origin(kind) is tuple:

@@ -54,14 +54,14 @@ def launch(folder: Path, batches: int, launcher: str, options: Sequence[str]) ->
         options: "launcher.KEY=value", the launcher's own.
     """
     folder = folder.resolve()
-    command = [sys.executable, "-m", "matd3_jax.sweep.launcher", "--multirun", f"sweep={_quoted(folder)}"]
+    command = [sys.executable, "-m", "matd3_jax.sweep.launcher", "--multirun", f"sweep={quoted(folder)}"]
     command += [f"batch={','.join(map(str, range(batches)))}", f"hydra/launcher={launcher}"]
-    command += [f"hydra.sweep.dir={_quoted(folder / 'jobs')}", "hydra.sweep.subdir=${batch}"]
+    command += [f"hydra.sweep.dir={quoted(folder / 'jobs')}", "hydra.sweep.subdir=${batch}"]
     command += [f"hydra.{option}" for option in options]
     return subprocess.run(command).returncode
 
 
-def _quoted(path: Path) -> str:
+def quoted(path: Path) -> str:
     """A path as a string in Hydra's grammar."""
     text = re.sub(r"(\\*)'", r"\1\1\'", str(path))
     text = re.sub(r"(\\+)$", r"\1\1", text)

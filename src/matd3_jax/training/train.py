@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,10 +14,12 @@ from matd3_jax.envs.check import check
 from matd3_jax.envs.environment import Environment
 from matd3_jax.runtime import devices
 from matd3_jax.training.loggers import CallbackLogger, HistoryLogger, Logger
-from matd3_jax.training.recording import Recorded, Recorder
 from matd3_jax.training.run import run
 from matd3_jax.training.session import Row, TrainingSession
 from matd3_jax.training.state import TrainState
+
+if TYPE_CHECKING:
+    from matd3_jax.training.recording import Recorded, Recorder
 
 
 @dataclasses.dataclass
@@ -80,7 +82,7 @@ def train(
         config = dataclasses.replace(config, env={"name": type(own).__name__})
     every = [*loggers, *([] if callback is None else [CallbackLogger(callback)])]
     if run_dir is not None:
-        return _result(Recorder(loggers=every).start(config, Path(run_dir), own))
+        return _result(_recorder(every).start(config, Path(run_dir), own))
     training = TrainingSession(config, own)
     state, row = training.start()
     history = HistoryLogger(row)
@@ -114,10 +116,17 @@ def resume(
     if env is not None:
         check(env)
     every = [*loggers, *([] if callback is None else [CallbackLogger(callback)])]
-    return _result(Recorder(loggers=every).resume(Path(run_dir), checkpoint, total_steps, env))
+    return _result(_recorder(every).resume(Path(run_dir), checkpoint, total_steps, env))
 
 
-def _result(recorded: Recorded) -> Result:
+def _recorder(loggers: Sequence[Logger]) -> "Recorder":
+    """Imported here: figures and checkpoints are for runs that leave a directory."""
+    from matd3_jax.training.recording import Recorder
+
+    return Recorder(loggers=loggers)
+
+
+def _result(recorded: "Recorded") -> Result:
     table = recorded.directory.read_metrics()
     seeds = np.unique(table["seed"])
     columns = {name: np.stack([column[table["seed"] == seed] for seed in seeds]) for name, column in table.items()}
