@@ -18,8 +18,6 @@ ENVS, LENGTH, EPISODE = 500, 12, 6
 LOW, HIGH = 0.01, 0.05
 """Narrow, so that hardly any action is clipped by the Box: the noise can be read off the actions."""
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 
 @pytest.fixture(scope="module")
 def collected():

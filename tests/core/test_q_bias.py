@@ -41,8 +41,6 @@ GAMMA = (0.9, 0.7)
 LEDGER_HYPER = tuple(HYPER._replace(gamma=gamma) for gamma in GAMMA)
 POINT = make("point_reach", num_agents=2, dim=2, episode_length=3)
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 
 def pairs_of_ledger(number):
     """Running episodes of both kinds, and any actions."""
@@ -295,7 +293,7 @@ def table(path):
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory, quick_jit):
+def finished(tmp_path_factory):
     out = tmp_path_factory.mktemp("runs")
     assert train.main([*SETTINGS, f"out={out}", "name=full"]) == 0
     return out / "full"

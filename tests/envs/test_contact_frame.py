@@ -9,8 +9,6 @@ import pytest
 from matd3_jax.envs.robots.engines import contact_frame
 from matd3_jax.envs.robots.engines.quietly import collision_driver, mjx
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 XML = """<mujoco><worldbody><geom type="plane" size="5 5 .1"/>
 <body><freejoint/><geom type="capsule" size=".1 .3"/></body></worldbody></mujoco>"""
 

@@ -28,11 +28,6 @@ TINY = [
 SWEPT = ["algo.lr=0.01,0.1", "algo.tau=0.01,0.5"]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick(quick_jit):
-    """Every program of this module compiles with little optimization."""
-
-
 def leaves(run: Path) -> dict[str, np.ndarray]:
     """Every array but the replay of a run's last checkpoint."""
     import orbax.checkpoint as ocp

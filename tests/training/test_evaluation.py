@@ -21,8 +21,6 @@ SMALL = {
     "log_every": CHUNK, "replay_capacity": 1200, "eval_episodes": EPISODES,
 }  # fmt: skip
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 
 def train(**options):
     return matd3_jax.train("algo.hidden=[8]", env=Ledger(), **{**SMALL, **options})

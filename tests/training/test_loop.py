@@ -23,8 +23,6 @@ MADDPG = Algorithm(name="maddpg", hidden=(4,), num_critics=1, policy_delay=1)
 SCHEDULE = Schedule(num_envs=3, rollout_length=4, batch_size=8, replay_capacity=60, learning_starts=36)
 SEEDS = 3
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 
 def make(seeds, schedule=SCHEDULE, delays=(2, 1), env=None, tau=0.1, **options):
     """A trainer of Ledger with one team an agent: MATD3-like for the first, MADDPG-like for the others."""
@@ -223,15 +221,12 @@ def test_moves(monkeypatch, delays, updates):
     assert got == want
 
 
-@pytest.mark.parametrize("delays, updates", [((2, 2), 3), ((3, 1), 2)])
-def test_moves_where_delay_and_updates_do_not_fit(monkeypatch, delays, updates):
-    """The same where neither of delay and updates_per_collect divides the other; a ValueError would do, too."""
-    try:
-        got, want = moves(monkeypatch, delays, updates)
-    except ValueError as error:
-        assert "policy_delay" in str(error)
-    else:
-        assert got == want
+@pytest.mark.parametrize("delays, updates, delay", [((2, 2), 3, 2), ((3, 1), 2, 3), ((1, 4), 6, 4)])
+def test_delay_and_updates_that_do_not_fit_are_refused(delays, updates, delay):
+    """Where neither of delay and updates_per_collect divides the other, for any of the teams."""
+    message = f"updates_per_collect={updates} and policy_delay={delay}: one must divide the other"
+    with pytest.raises(ValueError, match=message):
+        make([0], dataclasses.replace(SCHEDULE, updates_per_collect=updates), delays)
 
 
 @pytest.mark.parametrize("shared", [False, True])

@@ -38,8 +38,6 @@ CRITICS, ACTORS = 0, 1
 N_STEP = {"matd3-3-step": ("matd3", 3)}
 """Values of returns over several steps: the policies that the critics judge stay as they are, so they are the same."""
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 
 @dataclasses.dataclass(frozen=True)
 class Probes(Environment):

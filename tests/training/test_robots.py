@@ -9,8 +9,6 @@ from matd3_jax import config
 from matd3_jax.training import checkpoint
 from matd3_jax.training.session import TrainingSession
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 SMALL = ("algo.hidden=[16]", "learning_starts=80", "replay_capacity=1000", "env.episode_length=20", "eval_episodes=2")
 
 

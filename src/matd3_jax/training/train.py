@@ -51,6 +51,14 @@ def train(
         loggers: get the same rows, and are closed at the end (see `training.loggers.Logger`).
 
     Raises UserError for settings that are unknown or impossible.
+
+    Example:
+        >>> small = dict(total_steps=300, learning_starts=100, batch_size=16, log_every=100, eval_every=0)
+        >>> result = train("algo.hidden=[8]", env="simple_spread", algo="matd3", seeds=2, num_envs=2, **small)
+        >>> result.metrics["step"][0].tolist()
+        [50, 150, 250, 350]
+        >>> result.metrics["return_agents"].shape, result.evaluate(episodes=3).shape
+        ((2, 4), (2, 3, 3))
     """
     devices.prepare()
     own = None if isinstance(env, str) else env
