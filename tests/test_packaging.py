@@ -81,16 +81,10 @@ def source(kind: str, repository: Path, folder: Path) -> Path:
 def installed(request, repository, tmp_path_factory) -> Path:
     """The folder that one of the sources was installed into, by itself and without a network."""
     folder = tmp_path_factory.mktemp(request.param)
-    words = [
-        "--quiet",
-        "--disable-pip-version-check",
-        "--no-index",
-        "--no-deps",
-        "--no-build-isolation",
-        "--no-compile",
-    ]
-    place = ["--target", folder / "site", source(request.param, repository, folder)]
-    done = subprocess.run([sys.executable, "-m", "pip", "install", *words, *place], capture_output=True, text=True)
+    words = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-compile"]
+    words += ["--no-index", "--no-deps", "--no-build-isolation", "--target", folder / "site"]
+    words += [source(request.param, repository, folder)]
+    done = subprocess.run(words, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     shutil.rmtree(folder / "checkout", ignore_errors=True)  # nothing may be read from there
     return folder / "site"
@@ -122,25 +116,16 @@ def users(tmp_path_factory) -> dict[str, str]:
 def test_an_installation_trains(installed, users, tmp_path):
     """From a folder that knows nothing of the project, with the libraries of this interpreter."""
     settings = ["env=simple_spread", "seeds=2", "total_steps=400", "learning_starts=200", "batch_size=32"]
-    settings += [
-        "algo.hidden=[16]",
-        "log_every=100",
-        "eval_every=200",
-        "eval_episodes=2",
-        "name=first",
-        f"out={tmp_path}",
-    ]
-    code = (
-        "import runpy, matd3_jax; print(matd3_jax.__file__); runpy.run_module('matd3_jax.train', run_name='__main__')"
-    )
+    settings += ["algo.hidden=[16]", "log_every=100", "eval_every=200", "eval_episodes=2", "name=first"]
+    code = "import runpy, matd3_jax as m; print(m.__file__); runpy.run_module('matd3_jax.train', run_name='__main__')"
     environment = users | {"PYTHONPATH": str(installed)}
     words = [sys.executable, "-c", code, *settings]
     done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert Path(done.stdout.splitlines()[0]) == installed / "matd3_jax" / "__init__.py"
-    with (tmp_path / "first" / "metrics.csv").open(newline="") as file:
+    with (tmp_path / "runs" / "first" / "metrics.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert {row["seed"] for row in rows} == {"0", "1"} and int(rows[-1]["step"]) >= 400
     losses = [float(value) for name, value in rows[-1].items() if name.endswith("critic_loss")]
     assert len(losses) == 3 and np.isfinite(losses).all()
-    assert (tmp_path / "first" / "summary.json").exists()
+    assert (tmp_path / "runs" / "first" / "summary.json").exists()

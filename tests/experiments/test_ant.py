@@ -74,9 +74,8 @@ def test_report(runs, tmp_path, monkeypatch):
             ends = (2 + np.sqrt(2) * np.array([[-1], [1]])) * step + level
             np.testing.assert_allclose(band, [step, *ends / scale])
         assert axis.get_xlabel() == "env steps of each seed"
-    assert (
-        returns.get_ylabel() == "evaluation: return" and velocity.get_ylabel() == "evaluation: forward velocity (m/s)"
-    )
+    labels = ["evaluation: return", "evaluation: forward velocity (m/s)"]
+    assert [axis.get_ylabel() for axis in (returns, velocity)] == labels
     assert [text.get_text() for text in returns.texts] == ["standing still"] and not velocity.texts
     np.testing.assert_array_equal(returns.lines[2].get_ydata(), [1000, 1000])
     assert figures[out / "curves.png"].get_suptitle() == "ant: mean ± sd over seeds"

@@ -1,4 +1,4 @@
-"""What figures show: the figures themselves as they are written, lines by label, bands, bars; and pixels of the file."""
+"""What figures show: lines by label, bands and bars of the figures that are written, and the colors of their files."""
 
 from pathlib import Path
 
