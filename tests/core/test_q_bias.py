@@ -11,6 +11,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pictures
 import pytest
 import reference
 import scipy.stats
@@ -29,6 +30,7 @@ from matd3_jax.envs import make
 from matd3_jax.envs.point_reach import PointState
 from matd3_jax.errors import UserError
 from matd3_jax.figures import q_bias as q_bias_figure
+from matd3_jax.figures.palette import AGENT
 from matd3_jax.runs import overestimation
 from matd3_jax.training import checkpoint
 from matd3_jax.training.loop import TrainLoop
@@ -313,7 +315,7 @@ def test_a_run_tells_of_it(finished, capsys):
             over = float(row[f"{agent}_q_estimate"]) - float(row[f"{agent}_q_true"])
             np.testing.assert_allclose(float(row[f"{agent}_overestimation"]), over, rtol=1e-5, atol=1e-6)
             assert not float(row[f"{agent}_q_true"]) > 0  # its rewards are negative
-    assert (finished / "q_bias.png").read_bytes()[:4] == b"\x89PNG"
+    assert {f"#{r:02X}{g:02X}{b:02X}" for r, g, b in AGENT[:2]} <= pictures.colors(finished / "q_bias.png")
     summary = json.loads((finished / "summary.json").read_text())["overestimation"]
     last = [float(row["agent_1_overestimation"]) for row in rows[-2:]]
     want = np.mean(last), 12.706 * np.std(last, ddof=1) / np.sqrt(2)  # Student's t of one degree of freedom
@@ -365,8 +367,12 @@ def test_too_short_rollouts_are_told_of(gamma, steps, words):
     assert (note is None) if words is None else re.search(words, note)
 
 
+def lines_of(axis):
+    return {label: line.tolist() for label, line in pictures.lines(axis).items()}
+
+
 @pytest.mark.parametrize("seeds", [1, 2])
-def test_lines_and_figure_of_any_number_of_seeds(seeds, tmp_path):
+def test_lines_and_figure_of_any_number_of_seeds(seeds, tmp_path, monkeypatch):
     """One seed: the interval is that of its pairs."""
     metrics = {
         "updates": np.repeat([0.0, 1.0, 2.0], seeds),
@@ -380,9 +386,23 @@ def test_lines_and_figure_of_any_number_of_seeds(seeds, tmp_path):
     head, *lines = overestimation.lines(metrics, "abc", 200)
     assert ("200 rollouts)" if seeds == 1 else "2 seeds)") in head
     assert lines[0] == f"  a: estimate 3, truth 4, overestimation 6 ± {'7' if seeds == 1 else '0'}"
-    path = tmp_path / "q_bias.png"
+    path, figures = tmp_path / "q_bias.png", pictures.written(monkeypatch)
     q_bias_figure.draw(path, metrics, {"agents": ["a", "b"], "adversaries": ["c"]}, "title")
-    assert path.read_bytes()[:4] == b"\x89PNG"
+    *values, agents, adversaries = figures[path].axes
+    # Evaluations at 10 and 30 env steps; a, b and their mean.
+    for axis, estimate in zip(values, (3.5, 8), strict=True):
+        assert lines_of(axis) == {
+            "estimate of the critics": [[10, 30], [estimate, estimate + 2]],
+            "true value of the policies": [[10, 30], [estimate + 1, estimate + 3]],
+        }
+    assert lines_of(agents) == {
+        "a": [[10, 30], [4, 6]], "b": [[10, 30], [9, 11]], "mean of the 2 agents": [[10, 30], [6.5, 8.5]]
+    }  # fmt: skip
+    assert lines_of(adversaries) == {"c": [[10, 30], [11, 13]]}
+    assert [axis.get_title() for axis in values] == ["agents", "adversaries"]
+    words = "title; one seed" if seeds == 1 else "title; mean of 2 seeds, 95 % interval"
+    assert figures[path].get_suptitle() == words
+    assert {f"#{r:02X}{g:02X}{b:02X}" for r, g, b in AGENT[:2]} <= pictures.colors(path)
     steps, values = overestimation.team_values(metrics, ["a", "b"], "q_true")
     np.testing.assert_array_equal(steps, [10, 30])
     np.testing.assert_array_equal(values, [[4.5, 6.5]] * seeds)

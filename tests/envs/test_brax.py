@@ -7,20 +7,16 @@ import sys
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 from matd3_jax import config
 from matd3_jax.envs import Box, OptionError, make, names
-from matd3_jax.envs.wrappers.joint_team import JointTeam
-
-pytest.importorskip("brax")
-
 from matd3_jax.envs.robots import brax_models as models
 from matd3_jax.envs.robots.brax import BraxState
 from matd3_jax.envs.robots.quiet import quiet, quiet_mujoco
-
-mujoco = pytest.importorskip("mujoco")
+from matd3_jax.envs.wrappers.joint_team import JointTeam
 
 ROBOTS = {  # name -> brax's name, size of its observation, controls
     "ant": ("ant", 27, 8),
