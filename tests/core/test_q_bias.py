@@ -260,6 +260,7 @@ def test_measuring_by_seed():
         assert (more > 0).all() and ended.any() and on.any()
 
 
+@pytest.mark.slow
 def test_training_is_the_same_with_and_without():
     """Networks, optimizers, replay, environments and keys; without, not a leaf of it. After the warm-up to the bit, and
     so later as XLA compiles the loop by default; with little optimization it rounds some sums otherwise."""
@@ -301,6 +302,7 @@ def finished(tmp_path_factory):
     return out / "full"
 
 
+@pytest.mark.slow
 def test_a_run_tells_of_it(finished, capsys):
     """Columns at evaluations and nan between them, and before anything was collected; the figure, and the summary."""
     rows = table(finished)
@@ -324,6 +326,7 @@ def test_a_run_tells_of_it(finished, capsys):
     np.testing.assert_allclose(summary["agent_1"]["overestimation_mean"][0], np.nanmean(every), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_stopped_between_evaluations_and_resumed(finished, tmp_path):
     """From a checkpoint half way to an evaluation, whose reservoir already holds what came before: the same table."""
     copy = Path(shutil.copytree(finished, tmp_path / "copy"))

@@ -177,6 +177,7 @@ def test_runs_with_other_settings_are_refused(tmp_path):
         grid_search.main(["task=ant", "scale=small"])
 
 
+@pytest.mark.slow
 def test_training_from_the_command(tmp_path):
     """A study trains a setting, reports it, and the next time uses it as it is."""
     argv = ["scale=small", "only=simple_spread-maddpg", "seeds=2", "total_steps=1000", "algo.hidden=[8]",

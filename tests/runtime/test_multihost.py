@@ -268,6 +268,7 @@ def alone(tmp_path_factory) -> Path:
     return out / "run"
 
 
+@pytest.mark.slow
 def test_two_processes_make_the_run_of_one(alone, tmp_path):
     """Four seeds on three devices and three on one; SIGTERM to the second alone. Both stop with one checkpoint, each
     having written its part; this process goes on from it, to the run of one device."""
@@ -325,6 +326,7 @@ def leaves(run: Path) -> dict[str, np.ndarray]:
     return {name: np.asarray(leaf) for name, leaf in found.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", range(3))
 def test_any_number_of_processes_reads_a_checkpoint_of_one(alone, index):
     run, settings = RunDirectory.open(alone)
@@ -355,6 +357,7 @@ class OneAtATime(ocp.StandardCheckpointer):
             self.lock.release()
 
 
+@pytest.mark.slow
 def test_a_sweep_shares_the_seeds_of_each_piece(tmp_path, monkeypatch):
     """Two processes: a piece of two runs, with three seeds (the third in the second process) and with one, and a piece
     of one seed, which the second process sits out. The same runs as in one process."""

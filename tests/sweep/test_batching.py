@@ -99,6 +99,7 @@ def test_packing_takes_no_more_pieces_than_needed():
 # ---- memory ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "more",
     [

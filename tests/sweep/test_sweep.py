@@ -52,6 +52,7 @@ def test_one_piece_holds_what_shares_a_program(swept):
     assert len(Sweep(swept).pieces) == 1 and len(Sweep(swept).pieces[0]) == 4
 
 
+@pytest.mark.slow
 def test_each_member_equals_the_same_run_made_alone(swept, tmp_path):
     """Metrics, networks, optimizers, environments and keys of one member, against a run of its settings."""
     assert train.main([*TINY, "algo.lr=0.1", "algo.tau=0.01", "seeds=2", f"out={tmp_path}", "name=alone"]) == 0
@@ -164,6 +165,7 @@ def test_a_sweep_that_diverged_everywhere_is_reported(swept, tmp_path):
         assert [row["diverged"] for row in csv.DictReader(file)] == ["2"] * 4
 
 
+@pytest.mark.slow
 def test_stopped_and_gone_on_with_it_is_the_same_sweep(swept, tmp_path, monkeypatch, capsys):
     """A signal after the third interval; what is left is gone on with, to the same numbers."""
     advance, calls = TrainingSession.advance, []
@@ -186,6 +188,7 @@ def test_stopped_and_gone_on_with_it_is_the_same_sweep(swept, tmp_path, monkeypa
     assert not (tmp_path / "cut" / "pieces" / "0").exists()  # its checkpoints, replays in them, are of no more use
 
 
+@pytest.mark.slow
 def test_pieces_are_jobs_of_their_own_and_cut_by_memory(swept, tmp_path, monkeypatch, capsys):
     """With memory for two seeds: two pieces, trained apart, the same table in the end. What one process works at,
     another leaves alone."""

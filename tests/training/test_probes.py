@@ -20,6 +20,8 @@ from matd3_jax.envs import Box, Environment, Simplex, TimeStep
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.schedule import Schedule
 
+pytestmark = pytest.mark.slow
+
 GAMMA = 0.8
 ALGORITHMS = {
     "matd3": Algorithm(hidden=(16,), clip="none"),
