@@ -24,7 +24,10 @@ FULL = {"xla_backend_optimization_level": 3, "xla_llvm_disable_expensive_passes"
 WORKERS = 4
 """At most: each needs up to 2 GB."""
 
-if "PYTEST_XDIST_WORKER" not in os.environ:  # workers get all of it from the process that starts them
+IN_WORKER = "PYTEST_XDIST_WORKER" in os.environ
+"""Set by pytest-xdist before this file is read, and by it in all that a worker starts."""
+
+if not IN_WORKER:  # workers get all of it from the process that starts them
     flags = [f"--{name}={str(value).lower()}" for name, value in OPTIONS.items()]
     os.environ["XLA_FLAGS"] = " ".join([*flags, os.environ.get("XLA_FLAGS", "")]).strip()
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
@@ -37,8 +40,11 @@ import jax  # noqa: E402  (reads the environment when it is imported)
 jax.config.update("jax_num_cpu_devices", 2)  # counts only before the first computation, hence here
 
 
+@pytest.hookimpl(tryfirst=True)  # before the workers are counted
 def pytest_cmdline_main(config: pytest.Config) -> None:
     """Share the files out among workers, unless told how many (-n) or given one file only."""
+    if IN_WORKER:
+        return  # or each worker would start its own
     files = {argument.split("::")[0] for argument in config.args}
     one = len(files) == 1 and all(Path(name).is_file() for name in files)
     if getattr(config.option, "numprocesses", 0) is None and not one and not config.option.usepdb:
@@ -48,7 +54,7 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
 
 def pytest_unconfigure(config: pytest.Config) -> None:
     folder = Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
-    if "PYTEST_XDIST_WORKER" not in os.environ and folder.name.startswith("matd3_jax-tests-"):
+    if not IN_WORKER and folder.name.startswith("matd3_jax-tests-"):
         shutil.rmtree(folder, ignore_errors=True)
 
 
