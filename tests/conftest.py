@@ -30,6 +30,7 @@ IN_WORKER = "PYTEST_XDIST_WORKER" in os.environ
 if not IN_WORKER:  # workers get all of it from the process that starts them
     flags = [f"--{name}={str(value).lower()}" for name, value in OPTIONS.items()]
     os.environ["XLA_FLAGS"] = " ".join([*flags, os.environ.get("XLA_FLAGS", "")]).strip()
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # workers share an accelerator
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="matd3_jax-tests-")
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
@@ -48,7 +49,8 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
     files = {argument.split("::")[0] for argument in config.args}
     one = len(files) == 1 and all(Path(name).is_file() for name in files)
     if getattr(config.option, "numprocesses", 0) is None and not one and not config.option.usepdb:
-        config.option.numprocesses = min(len(os.sched_getaffinity(0)), WORKERS)
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        config.option.numprocesses = min(cores, WORKERS)
         config.option.dist = "loadfile"  # fixtures of a module are made once
 
 
