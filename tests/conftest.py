@@ -1,35 +1,71 @@
-"""Two CPU devices for the tests of sharding, and quick compiles for programs that run only a few times."""
+"""Two CPU devices for the tests of sharding, quick compiles, and a worker for each core.
+
+Nearly all of the suite's time goes into compiling. Therefore everything, single operations and the processes that tests
+start included, is compiled with little optimization, and a program that was compiled once is loaded from then on.
+"""
 
 import functools
+import importlib.metadata
+import os
+import shutil
+import tempfile
+from pathlib import Path
 
-import jax
-import optax  # noqa: F401  (uses jax.jit when imported: not the quick one, which must not be nested)
 import pytest
+
+OPTIONS = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+"""Compile three to five times faster; what is computed stays the same."""
+if importlib.metadata.version("jaxlib").startswith("0.10."):
+    OPTIONS["xla_cpu_use_fusion_emitters"] = False  # other versions end the process over a flag that they do not know
+
+FULL = {"xla_backend_optimization_level": 3, "xla_llvm_disable_expensive_passes": False}
+"""What programs compile with outside of the tests."""
+
+WORKERS = 4
+"""At most: each needs up to 2 GB."""
+
+IN_WORKER = "PYTEST_XDIST_WORKER" in os.environ
+"""Set by pytest-xdist before this file is read, and by it in all that a worker starts."""
+
+if not IN_WORKER:  # workers get all of it from the process that starts them
+    flags = [f"--{name}={str(value).lower()}" for name, value in OPTIONS.items()]
+    os.environ["XLA_FLAGS"] = " ".join([*flags, os.environ.get("XLA_FLAGS", "")]).strip()
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # workers share an accelerator
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="matd3_jax-tests-")
+        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+        os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
+
+import jax  # noqa: E402  (reads the environment when it is imported)
 
 jax.config.update("jax_num_cpu_devices", 2)  # counts only before the first computation, hence here
 
-OPTIONS = {
-    "xla_backend_optimization_level": 0,
-    "xla_llvm_disable_expensive_passes": True,
-    "xla_cpu_use_fusion_emitters": False,
-}
-"""Compile three to five times faster; what is computed stays the same."""
+
+@pytest.hookimpl(tryfirst=True)  # before the workers are counted
+def pytest_cmdline_main(config: pytest.Config) -> None:
+    """Share the files out among workers, unless told how many (-n) or given one file only."""
+    if IN_WORKER:
+        return  # or each worker would start its own
+    files = {argument.split("::")[0] for argument in config.args}
+    one = len(files) == 1 and all(Path(name).is_file() for name in files)
+    if getattr(config.option, "numprocesses", 0) is None and not one and not config.option.usepdb:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        config.option.numprocesses = min(cores, WORKERS)
+        config.option.dist = "loadfile"  # fixtures of a module are made once
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    folder = Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
+    if not IN_WORKER and folder.name.startswith("matd3_jax-tests-"):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture(scope="session")
-def quickly_compiled():
-    """`jax.jit` with little optimization, where this XLA knows the options."""
-    try:
-        jax.jit(lambda x: x + 1, compiler_options=OPTIONS)(0)
-    except jax.errors.JaxRuntimeError:  # another backend or version: only slower
-        return jax.jit
-    return functools.partial(jax.jit, compiler_options=OPTIONS)
+def fully_optimized():
+    """`jax.jit` as it compiles outside of the tests."""
+    return functools.partial(jax.jit, compiler_options=FULL)
 
 
-@pytest.fixture(scope="module")
-def quick_jit(quickly_compiled):
-    """`jax.jit` is `quickly_compiled` within the module: not for programs that themselves call `jax.jit`."""
-    patch = pytest.MonkeyPatch()
-    patch.setattr(jax, "jit", quickly_compiled)
-    yield
-    patch.undo()
+@pytest.fixture(scope="session")
+def quick_jit():
+    """Everything compiles quickly; until the modules that ask for it no longer do."""

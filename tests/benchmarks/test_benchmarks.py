@@ -5,12 +5,14 @@ import json
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pictures
 import pytest
 
 from benchmarks import compile_times, fresh, growth, growth_figure, guard, loop
 from benchmarks.loop import copies_in
 from matd3_jax import config
 from matd3_jax.errors import UserError
+from matd3_jax.figures.learning_curves import COLORS
 from matd3_jax.training.session import TrainingSession
 
 
@@ -20,7 +22,7 @@ def point(value, seconds, megabytes=10.0):
             "product_flops_of_a_cycle": 1e9 * seconds, "memory": memory}  # fmt: skip
 
 
-def test_exponents_and_figure(tmp_path):
+def test_exponents_and_figure(tmp_path, monkeypatch):
     """A square law, one that turns from flat to cubic, and points that could not be measured."""
     axes = {
         "seeds": [point(n, 0.1 * n**2, 3 * n) for n in (1, 2, 4, 8)],
@@ -32,8 +34,31 @@ def test_exponents_and_figure(tmp_path):
     # Through (0, 0), (1, 0), (2, 0), (3, 3) in powers of two the least-squares slope is (1.5 x 3) / 5 = 0.9.
     assert found["agents"]["time"] == {"all": 0.9, "upper": 3.0} and found["agents"]["process"]["all"] == 0.0
     assert "batch" not in found
-    growth_figure.draw(tmp_path / "growth.png", axes)
-    assert (tmp_path / "growth.png").stat().st_size > 10_000
+    figures, path = pictures.written(monkeypatch), tmp_path / "growth.png"
+    growth_figure.draw(path, axes)
+    columns = np.reshape(figures[path].axes, (2, 3)).T
+    assert [below.get_xlabel() for _, below in columns] == ["seeds", "agents", "minibatch"]
+    for (above, below), points in zip(columns, axes.values(), strict=True):
+        x, seconds, megabytes = np.array(
+            [(p["value"], p["cycle_seconds"], p["memory"]["xla"] / 1e6) for p in points if "error" not in p]
+        ).T
+        time, memory = pictures.lines(above), pictures.lines(below)
+        np.testing.assert_allclose(time["measured"], [x, 1000 * seconds])
+        np.testing.assert_allclose(time["as the products"], [x, 1000 * seconds])  # what `point` says of them
+        (band,) = pictures.bands(above)
+        np.testing.assert_allclose(band, [x, 900 * seconds, 1200 * seconds])
+        wanted = {"process at most": 1000, "the interval's, by XLA": megabytes, "of it the replay": 5}
+        assert memory.keys() == wanted.keys()
+        for name, line in memory.items():
+            np.testing.assert_allclose(line, np.broadcast_arrays(x, wanted[name]))
+        powers = ["quadratic", "cubic"] if below.get_xlabel() == "agents" else ["linear"]
+        assert [[text.get_text() for text in axis.texts] for axis in (above, below)] == [powers] * 2
+        assert above.get_xscale() == above.get_yscale() == below.get_yscale() == "log"
+        # A power may leave the picture, what was measured may not.
+        for axis, values in ((above, 1000 * seconds), (below, megabytes)):
+            assert axis.get_ylim()[0] < values.min() and values.max() < axis.get_ylim()[1]
+    assert [axis.get_ylabel() for axis in columns[0]] == ["ms an iteration, all seeds", "MB"]
+    assert {COLORS[0].upper(), COLORS[1].upper(), COLORS[4].upper()} <= pictures.colors(path)
 
 
 def test_points_of_the_growth_study_are_possible():

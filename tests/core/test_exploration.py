@@ -18,7 +18,13 @@ ENVS, LENGTH, EPISODE = 500, 12, 6
 LOW, HIGH = 0.01, 0.05
 """Narrow, so that hardly any action is clipped by the Box: the noise can be read off the actions."""
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
+
+def fresh(layout):
+    return jax.jit(lambda key: update.init(layout, key))(jax.random.key(0))
+
+
+def started(env, layout, envs):
+    return jax.jit(lambda key: rollout.start(env, key, envs, rollout.ranged(layout)))(jax.random.key(1))
 
 
 @pytest.fixture(scope="module")
@@ -31,9 +37,9 @@ def collected():
     algorithm = Algorithm(hidden=(4,), noise_range=True)
     layout = JointLayout.of(env, {"agents": algorithm})
     hyper = HYPER._replace(exploration_noise=LOW, exploration_noise_high=HIGH)
-    actors = tuple(jax.tree.map(jnp.zeros_like, g.actor) for g in update.init(layout, jax.random.key(0)))
+    actors = tuple(jax.tree.map(jnp.zeros_like, g.actor) for g in fresh(layout))
     policy = PolicyParams(actors, (hyper,) * len(layout.groups), None)
-    start = rollout.start(env, jax.random.key(1), ENVS, rollout.ranged(layout))
+    start = started(env, layout, ENVS)
     end, rows, _, _ = jax.jit(lambda s: rollout.collect(env, layout, policy, s, jax.random.key(2), LENGTH))(start)
     space = env.action_spaces[0]
     action = np.asarray(layout.row_parts(rows).action).reshape(LENGTH, ENVS, 2, -1)
@@ -81,12 +87,13 @@ def test_without_a_range_nothing_is_kept_and_nothing_changes():
     found = {}
     for ranged in (False, True):
         layout = JointLayout.of(env, {"agents": Algorithm(hidden=(4,), noise_range=ranged)})
-        groups = update.init(layout, jax.random.key(0))
+        groups = fresh(layout)
         hyper = HYPER._replace(exploration_noise=0.2, exploration_noise_high=0.2)
         policy = PolicyParams(tuple(g.actor for g in groups), (hyper,) * len(groups), None)
-        start = rollout.start(env, jax.random.key(1), 3, rollout.ranged(layout))
+        start = started(env, layout, 3)
         assert (start.noise_quantile is None) == (not ranged)
-        found[ranged] = rollout.collect(env, layout, policy, start, jax.random.key(2), LENGTH)[1]
+        collect = jax.jit(lambda s, e=env, o=layout, p=policy: rollout.collect(e, o, p, s, jax.random.key(2), LENGTH))
+        found[ranged] = collect(start)[1]
     np.testing.assert_array_equal(found[False], found[True])
 
 
@@ -96,13 +103,13 @@ def test_outside_of_collecting_the_noise_is_in_the_middle_of_the_range():
         JointLayout.of(env, {"agents": Algorithm(hidden=(4,), noise_range=noise_range)})
         for noise_range in (False, True)
     )
-    actors = tuple(g.actor for g in update.init(fixed, jax.random.key(0)))
+    actors = tuple(g.actor for g in fresh(fixed))
     observation = [jnp.ones((5, size)) for size in env.observation_sizes]
     middle = PolicyParams(actors, (HYPER._replace(exploration_noise=0.3),), None)
     ends = PolicyParams(actors, (HYPER._replace(exploration_noise=0.2, exploration_noise_high=0.4),), None)
     key = jax.random.key(3)
-    one = rollout.decide(fixed, middle, observation, key)
-    other = rollout.decide(ranged, ends, observation, key)
+    decide = jax.jit(rollout.decide, static_argnums=0)
+    one, other = decide(fixed, middle, observation, key), decide(ranged, ends, observation, key)
     for a, b in zip(one, other, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)  # float32
 
@@ -113,14 +120,14 @@ def test_mixed_teams_keep_their_own_noise():
     env = make("simple_tag", actions="continuous")
     layout = JointLayout.of(env, algorithms)
     plain = JointLayout.of(env, {team: dataclasses.replace(a, noise_range=False) for team, a in algorithms.items()})
-    actors = tuple(g.actor for g in update.init(layout, jax.random.key(0)))
+    actors = tuple(g.actor for g in fresh(layout))
     hyper = HYPER._replace(exploration_noise=0.2, exploration_noise_high=0.4)
     policy = PolicyParams(actors, (hyper,) * len(layout.groups), None)
     observation = [jnp.ones((5, size)) for size in env.observation_sizes]
     draws = rollout._noise(layout, jax.random.key(1), (5,))
     quantile = jnp.full((5, layout.num_agents), 0.9)
-    got = rollout.act(layout, policy, observation, draws, quantile)
-    want = rollout.act(plain, policy, observation, draws)
+    act = jax.jit(rollout.act, static_argnums=0)
+    got, want = act(layout, policy, observation, draws, quantile), act(plain, policy, observation, draws)
     for i, team in enumerate(layout.teams):
         same = np.array_equal(layout.action_part(got, i), layout.action_part(want, i))
         assert same == (team == "adversaries")

@@ -22,8 +22,6 @@ ENVS, LENGTH, CAPACITY = 3, 4, 60
 ALGORITHM = Algorithm(name="maddpg", hidden=(4,), num_critics=1, policy_delay=1)
 SCHEDULE = Schedule(num_envs=ENVS, rollout_length=LENGTH, batch_size=8, replay_capacity=CAPACITY, learning_starts=36)
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 
 def layout(n_step):
     return JointLayout.of(Ledger(), {"agents": ALGORITHM, "adversaries": ALGORITHM}, n_step)

@@ -13,8 +13,6 @@ from matd3_jax.core.algorithm import Algorithm
 
 TOLERANCE = 1e-12  # both sides in float64: only the order of sums of a few dozen terms differs
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 
 def stacked(rng, stack, scale=1.0):
     """Random numbers in the form of two layers, each network of the stack of another size of numbers."""

@@ -14,8 +14,6 @@ TOLERANCE = 1e-12  # float64 on both sides; only the order of sums of up to ten 
 BOX = Box(2, -1.0, 3.0)
 CHOICES = (Simplex((5,)), Simplex((3, 2)), Simplex((5, 10)), Discrete(4), MultiDiscrete((2, 3)))
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 
 def policy_of(space, squash="sigmoid"):
     return policies.of(space, Algorithm(actor_output=squash))

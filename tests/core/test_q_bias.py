@@ -1,12 +1,6 @@
 """Overestimation: true values and estimates against rollouts and networks by hand, the reservoir against the replay."""
 
-import csv
-import dataclasses
 import functools
-import json
-import re
-import shutil
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -17,20 +11,14 @@ import scipy.stats
 from learner_cases import layers
 from ledger import ENDS, HYPER, Ledger, LedgerState, by_hand
 
-from matd3_jax import config
-from matd3_jax.cli import train
 from matd3_jax.core import q_bias, update
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
-from matd3_jax.core.q_bias import Pairs, Values
+from matd3_jax.core.q_bias import Pairs
 from matd3_jax.core.rollout import PolicyParams
 from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.envs import make
 from matd3_jax.envs.point_reach import PointState
-from matd3_jax.errors import UserError
-from matd3_jax.figures import q_bias as q_bias_figure
-from matd3_jax.runs import overestimation
-from matd3_jax.training import checkpoint
 from matd3_jax.training.evaluator import Evaluator
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.schedule import Schedule
@@ -41,8 +29,6 @@ LEDGER = JointLayout.of(Ledger(), {"agents": MATD3, "adversaries": IDDPG})
 GAMMA = (0.9, 0.7)
 LEDGER_HYPER = tuple(HYPER._replace(gamma=gamma) for gamma in GAMMA)
 POINT = make("point_reach", num_agents=2, dim=2, episode_length=3)
-
-pytestmark = pytest.mark.usefixtures("quick_jit")
 
 
 def pairs_of_ledger(number):
@@ -261,6 +247,7 @@ def test_measuring_by_seed():
         assert (more > 0).all() and ended.any() and on.any()
 
 
+@pytest.mark.slow
 def test_training_is_the_same_with_and_without():
     """Networks, optimizers, replay, environments and keys; without, not a leaf of it. After the warm-up to the bit, and
     so later as XLA compiles the loop by default; with little optimization it rounds some sums otherwise."""
@@ -278,144 +265,3 @@ def test_training_is_the_same_with_and_without():
 def test_an_evaluation_costs_no_second_compilation():
     """The state with a restarted reservoir fits the program that is there."""
     assert run()[3] == 0
-
-
-# ---- a run -----------------------------------------------------------------------------------------------------------
-
-SETTINGS = [
-    "env=point_reach", "algo=iltd3", "seeds=2", "algo.hidden=[8]", "batch_size=16", "learning_starts=100",
-    "total_steps=900", "log_every=100", "replay_capacity=500", "checkpoint_every=200", "keep_checkpoints=9",
-    "eval_every=400", "eval_episodes=2", "normalize_observations=true",
-    "diagnostics.q_bias=true", "diagnostics.q_bias_rollouts=7", "diagnostics.q_bias_steps=5",
-]  # fmt: skip
-
-
-def table(path):
-    with (path / "metrics.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory, quick_jit):
-    out = tmp_path_factory.mktemp("runs")
-    assert train.main([*SETTINGS, f"out={out}", "name=full"]) == 0
-    return out / "full"
-
-
-def test_a_run_tells_of_it(finished, capsys):
-    """Columns at evaluations and nan between them, and before anything was collected; the figure, and the summary."""
-    rows = table(finished)
-    evaluated = np.array([row["eval_return_agents"] != "nan" for row in rows])
-    there = evaluated & (np.array([row["step"] for row in rows]) != "0")
-    assert there.sum() + 2 == evaluated.sum() < len(rows)
-    for agent in ("agent_0", "agent_1"):
-        for name in overestimation.COLUMNS:
-            values = np.array([float(row[f"{agent}_{name}"]) for row in rows])
-            np.testing.assert_array_equal(np.isfinite(values), there)
-        for row in rows:
-            over = float(row[f"{agent}_q_estimate"]) - float(row[f"{agent}_q_true"])
-            np.testing.assert_allclose(float(row[f"{agent}_overestimation"]), over, rtol=1e-5, atol=1e-6)
-            assert not float(row[f"{agent}_q_true"]) > 0  # its rewards are negative
-    assert (finished / "q_bias.png").read_bytes()[:4] == b"\x89PNG"
-    summary = json.loads((finished / "summary.json").read_text())["overestimation"]
-    last = [float(row["agent_1_overestimation"]) for row in rows[-2:]]
-    want = np.mean(last), 12.706 * np.std(last, ddof=1) / np.sqrt(2)  # Student's t of one degree of freedom
-    np.testing.assert_allclose(summary["agent_1"]["overestimation"], want, rtol=1e-4)
-    every = [[float(r["agent_1_overestimation"]) for r in rows if r["seed"] == s] for s in "01"]
-    np.testing.assert_allclose(summary["agent_1"]["overestimation_mean"][0], np.nanmean(every), rtol=1e-6)
-
-
-def test_stopped_between_evaluations_and_resumed(finished, tmp_path):
-    """From a checkpoint half way to an evaluation, whose reservoir already holds what came before: the same table."""
-    copy = Path(shutil.copytree(finished, tmp_path / "copy"))
-    rows = table(copy)
-    evaluated = {int(row["step"]) for row in rows if row["eval_return_agents"] != "nan"}
-    first, *later = checkpoint.steps(copy / "checkpoints")
-    assert first not in evaluated and later
-    for step in later:
-        shutil.rmtree(copy / "checkpoints" / str(step))
-    assert train.main([f"resume={copy}"]) == 0
-    assert (copy / "metrics.csv").read_bytes() == (finished / "metrics.csv").read_bytes()
-
-
-# ---- numbers and words of it -----------------------------------------------------------------------------------------
-
-
-def test_columns():
-    """Means over the pairs and Student's intervals, for each seed and agent."""
-    rng = np.random.default_rng(7)
-    estimate, truth = rng.normal(size=(2, 3, 10, 2))
-    got = overestimation.columns(("a", "b"), Values(estimate, truth), 3)
-    assert set(got) == {f"{agent}_{name}" for agent in "ab" for name in overestimation.COLUMNS}
-    for i, agent in enumerate("ab"):
-        np.testing.assert_allclose(got[f"{agent}_q_estimate"], estimate[:, :, i].mean(axis=1))
-        for name, values in (("q_true", truth), ("overestimation", estimate - truth)):
-            low, high = scipy.stats.ttest_1samp(values[:, :, i], 0, axis=1).confidence_interval(0.95)
-            np.testing.assert_allclose(got[f"{agent}_{name}"], (low + high) / 2)
-            np.testing.assert_allclose(got[f"{agent}_{name}_interval"], (high - low) / 2)
-    none = overestimation.columns(("a", "b"), None, 3)
-    assert list(none) == list(got) and np.isnan(list(none.values())).all()
-
-
-@pytest.mark.parametrize(("gamma", "steps", "words"), [
-    (0.95, 100, None),
-    (np.array([0.95, 0.99]), 100, "leaves out 37 % .*; diagnostics.q_bias_steps=390 leaves out 2 %"),
-    (0.99, 390, None),
-    (1.0, 1000, r"leaves out 100 % .*positive$"),
-])  # fmt: skip
-def test_too_short_rollouts_are_told_of(gamma, steps, words):
-    note = overestimation.tail_note([HYPER._replace(gamma=0.5), HYPER._replace(gamma=gamma)], steps)
-    assert (note is None) if words is None else re.search(words, note)
-
-
-@pytest.mark.parametrize("seeds", [1, 2])
-def test_lines_and_figure_of_any_number_of_seeds(seeds, tmp_path):
-    """One seed: the interval is that of its pairs."""
-    metrics = {
-        "updates": np.repeat([0.0, 1.0, 2.0], seeds),
-        "step": np.repeat([10.0, 20.0, 30.0], seeds),
-        "seed": np.tile(np.arange(seeds), 3),
-    }
-    for agent, shift in (("a", 0), ("b", 5), ("c", 7)):
-        numbers = np.tile([1.0, np.nan, 3.0], (seeds, 1)).T.ravel() + shift
-        metrics |= {f"{agent}_{name}": numbers + k for k, name in enumerate(overestimation.COLUMNS)}
-    assert overestimation.summary(metrics, "c")["c"]["overestimation_mean"][0] == 13  # not the untrained critics' 11
-    head, *lines = overestimation.lines(metrics, "abc", 200)
-    assert ("200 rollouts)" if seeds == 1 else "2 seeds)") in head
-    assert lines[0] == f"  a: estimate 3, truth 4, overestimation 6 ± {'7' if seeds == 1 else '0'}"
-    path = tmp_path / "q_bias.png"
-    q_bias_figure.draw(path, metrics, {"agents": ["a", "b"], "adversaries": ["c"]}, "title")
-    assert path.read_bytes()[:4] == b"\x89PNG"
-    steps, values = overestimation.team_values(metrics, ["a", "b"], "q_true")
-    np.testing.assert_array_equal(steps, [10, 30])
-    np.testing.assert_array_equal(values, [[4.5, 6.5]] * seeds)
-
-
-# ---- settings --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("overrides", "words"), [
-    (["diagnostics.q_bias_rollouts=0"], "diagnostics.q_bias_rollouts=0: must be at least 1"),
-    (["diagnostics.q_bias_steps=0"], "diagnostics.q_bias_steps=0: must be at least 1"),
-    (["diagnostics.q_bias=2"], "diagnostics.q_bias=2: must be true or false"),
-    (["diagnostics=true"], "diagnostics=True: must be a group of keys"),
-    (["diagnostics.q_bais=true"], "did you mean 'q_bias"),
-    (["q_bias=true"], "did you mean 'diagnostics.q_bias'"),
-    (["diagnostics.q_bias=true", "eval_every=0"], "eval_every=0 means none"),
-])  # fmt: skip
-def test_mistakes(overrides, words):
-    with pytest.raises(UserError) as error:
-        config.load(overrides)
-    assert words in str(error.value) and "\n" not in str(error.value)
-
-
-def test_runs_from_before(tmp_path):
-    """Without the group, or with a part of it, a run's settings mean what they meant: off."""
-    old = config.load()
-    assert old.diagnostics == config.DiagnosticsConfig(q_bias=False, q_bias_rollouts=200, q_bias_steps=100)
-    on = dataclasses.replace(old, diagnostics=dataclasses.replace(old.diagnostics, q_bias=True))
-    for settings, kept in ((old, None), (old, {}), (on, {"q_bias": True})):
-        values = {key: value for key, value in settings.to_dict().items() if key != "diagnostics"}
-        values |= {} if kept is None else {"diagnostics": kept}
-        (tmp_path / "config.yaml").write_text(json.dumps(values))  # JSON is YAML
-        assert config.read(tmp_path / "config.yaml") == settings

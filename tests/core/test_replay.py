@@ -9,8 +9,6 @@ from matd3_jax.core import replay
 
 SEEDS, CAPACITY, N, WIDTH = 3, 12, 4, 5
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 
 def test_ring_with_wrap_around():
     """After each of 8 writes (more than two rounds) every row of every seed is where a Python ring has it, and `filled`

@@ -24,8 +24,6 @@ ENV = make("point_reach", num_agents=2, dim=2)  # Box actions: without noise the
 ALGORITHM = Algorithm(name="maddpg", hidden=(6,), num_critics=1, policy_delay=1)
 SCHEDULE = Schedule(num_envs=3, rollout_length=4, batch_size=8, replay_capacity=CAPACITY, learning_starts=36)
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 
 def trainer(n_step=1, normalize=True):
     layout = JointLayout.of(ENV, {"agents": ALGORITHM}, n_step)

@@ -7,7 +7,7 @@ import pytest
 
 
 @pytest.fixture(scope="session")
-def observe_and_step():
+def observe_and_step(fully_optimized):
     """env -> compiled (states, actions) -> (observations in the states, steps from them), over a leading axis.
 
     Kept for the session: compiling is what takes the time here, and files compare the same environments.
@@ -15,6 +15,6 @@ def observe_and_step():
 
     @functools.cache
     def program(env):
-        return jax.jit(jax.vmap(lambda state, action: (env.observe(state), env.step(None, state, action))))
+        return fully_optimized(jax.vmap(lambda state, action: (env.observe(state), env.step(None, state, action))))
 
     return program

@@ -11,8 +11,6 @@ import pytest
 from matd3_jax.envs import OptionError, make
 from matd3_jax.envs.robots.engines.models import CONTACT_POINTS
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 FILES = sorted((Path(__file__).parents[1] / "data" / "ant").glob("trajectory_*.npz"))
 BATCH = 50
 

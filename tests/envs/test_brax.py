@@ -7,20 +7,16 @@ import sys
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 from matd3_jax import config
 from matd3_jax.envs import Box, OptionError, make, names
-from matd3_jax.envs.wrappers.joint_team import JointTeam
-
-pytest.importorskip("brax")
-
 from matd3_jax.envs.robots import brax_models as models
 from matd3_jax.envs.robots.brax import BraxState
 from matd3_jax.envs.robots.quiet import quiet, quiet_mujoco
-
-mujoco = pytest.importorskip("mujoco")
+from matd3_jax.envs.wrappers.joint_team import JointTeam
 
 ROBOTS = {  # name -> brax's name, size of its observation, controls
     "ant": ("ant", 27, 8),
@@ -65,7 +61,7 @@ def random_action(env, rng):
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_steps_are_brax_s_own(robot, quickly_compiled):
+def test_steps_are_brax_s_own(robot):
     """Reset and three steps with the same key and actions, in one program, so that nothing but our part can differ."""
     split = {"split": LEGS} if robot == "ant" else {}
     env = make(f"brax_{robot}", **split)
@@ -92,7 +88,7 @@ def test_steps_are_brax_s_own(robot, quickly_compiled):
 
     stacked = tuple(map(np.stack, zip(*actions, strict=True)))
     brax_start, start, observation, (after, ts, full, measured) = jax.device_get(
-        quickly_compiled(both)(jax.random.key(3), stacked, controls)
+        jax.jit(both)(jax.random.key(3), stacked, controls)
     )
     n = len(env.agents)
     np.testing.assert_array_equal(start.full_observation, brax_start.obs)
@@ -153,18 +149,18 @@ def test_no_matrix_product_of_the_physics_is_left_at_a_gpu_s_default_precision()
 
 
 @pytest.fixture(scope="module")
-def ant(quickly_compiled):
+def ant():
     """brax_ant with the spring backend, and its compiled step for a batch."""
     env = make("brax_ant")
-    return env, quickly_compiled(jax.vmap(env.step, (None, 0, 0)))
+    return env, jax.jit(jax.vmap(env.step, (None, 0, 0)))
 
 
 class TestAnt:
-    def test_ends_of_episodes(self, ant, quickly_compiled):
+    def test_ends_of_episodes(self, ant):
         """Batched: standing; too high; at the time limit; broken; blown up; broken and at the time limit."""
         env, step = ant
         theirs = brax_env("ant", "spring")
-        start = quickly_compiled(theirs.pipeline_init)
+        start = jax.jit(theirs.pipeline_init)
 
         def state(z):
             """At rest at height z (m)."""
@@ -193,10 +189,10 @@ class TestAnt:
         # The bonus for being alive is paid on the step that ends it, too, as brax does.
         np.testing.assert_allclose(rewards[:3, 0], 1, atol=0.02)
 
-    def test_environments_of_a_batch_do_not_touch_each_other(self, ant, quickly_compiled):
+    def test_environments_of_a_batch_do_not_touch_each_other(self, ant):
         env, step = ant
         rng = np.random.default_rng(1)
-        states, _ = quickly_compiled(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 6))
+        states, _ = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 6))
         actions = tuple(rng.uniform(-1, 1, (6, 4)).astype(np.float32) for _ in range(2))
         order = np.array([3, 0, 5, 5, 1, 4])
         ts = step(None, states, actions)
@@ -225,10 +221,10 @@ class TestAnt:
 
 
 @pytest.mark.parametrize("robot", ["half_cheetah", "swimmer"])
-def test_positions_are_those_of_the_model_to_draw(robot, quickly_compiled):
+def test_positions_are_those_of_the_model_to_draw(robot):
     """MuJoCo puts every body where brax has it. (On the move, spring's joints give way by centimetres.)"""
     env = make(f"brax_{robot}")
-    state, _ = quickly_compiled(env.reset)(jax.random.key(0))
+    state, _ = jax.jit(env.reset)(jax.random.key(0))
     data = mujoco.MjData(env.mj_model)
     data.qpos[:] = env.qpos(state)
     mujoco.mj_kinematics(env.mj_model, data)

@@ -20,8 +20,6 @@ from matd3_jax.envs import OptionError, make
 from matd3_jax.envs.robots.engines import c, engine, models
 from matd3_jax.envs.robots.quiet import quiet_mujoco
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 FILES = ("ant", "half_cheetah", "hopper", "walker2d_v5", "humanoid", "swimmer")
 FIELDS = ("xpos", "qfrc_actuator", "cfrc_ext")
 SKIP = 5

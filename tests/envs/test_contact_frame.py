@@ -10,8 +10,6 @@ from matd3_jax.envs.robots.engines import contact_frame
 from matd3_jax.envs.robots.engines.quietly import mjx
 from matd3_jax.private import Moved, mjx_collisions
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 XML = """<mujoco><worldbody><geom type="plane" size="5 5 .1"/>
 <body><freejoint/><geom type="capsule" size=".1 .3"/></body></worldbody></mujoco>"""
 

@@ -5,15 +5,14 @@ import dataclasses
 import json
 import pathlib
 
+import gymnasium
+import mujoco
 import numpy as np
 import pytest
 
 from matd3_jax.envs import OptionError
 from matd3_jax.envs.robots.partition.graphs import GRAPHS
 from matd3_jax.envs.robots.partition.partition import default_split, describe, lay_out, partition
-
-mujoco = pytest.importorskip("mujoco")
-gymnasium = pytest.importorskip("gymnasium")
 
 RECORDED = json.loads((pathlib.Path(__file__).parents[1] / "data/ant/index_maps.json").read_text())
 PAPER = next(RECORDED[key] for key in RECORDED if key.startswith("paper_split_obs_59"))
@@ -116,12 +115,13 @@ def test_recorded_indices_of_mamujoco_s_ant(key):
 
 @pytest.fixture(scope="module")
 def mamujoco():
-    module = pytest.importorskip("gymnasium_robotics.envs.multiagent_mujoco.mujoco_multi")
+    from gymnasium_robotics.envs.multiagent_mujoco import mujoco_multi  # slow to import
+
     made = {}
 
     def make(robot, split, depth):
         if (robot, split, depth) not in made:
-            made[robot, split, depth] = module.MultiAgentMujocoEnv(SCENARIOS[robot], split, agent_obsk=depth)
+            made[robot, split, depth] = mujoco_multi.MultiAgentMujocoEnv(SCENARIOS[robot], split, agent_obsk=depth)
         return made[robot, split, depth]
 
     with quiet():

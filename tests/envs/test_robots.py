@@ -12,10 +12,8 @@ import pytest
 from matd3_jax.envs import make
 from matd3_jax.envs.robots.quiet import quiet_mujoco
 
-pytestmark = [
-    pytest.mark.usefixtures("quick_jit"),
-    pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass'"),  # of gymnasium's half_cheetah.xml
-]
+# Of gymnasium's half_cheetah.xml.
+pytestmark = pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass'")
 
 IDS = {
     "ant": "Ant-v5",

@@ -14,8 +14,6 @@ from ledger import Ledger
 from matd3_jax.evaluation import cross_play
 from matd3_jax.evaluation.cross_play_table import pairs_of
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 
 def by_numpy(run, seed, team, observation):
     """{agent: action} of a team for everybody's observations, in float64, written from what a run's settings say."""

@@ -7,6 +7,7 @@ import shlex
 import shutil
 
 import numpy as np
+import pictures
 import pytest
 from study_cases import NOISE, fake_run, verdicts
 
@@ -29,7 +30,7 @@ from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.sweep import runner
 
 
-def test_competitive_from_run_directories(tmp_path):
+def test_competitive_from_run_directories(tmp_path, monkeypatch):
     """The team of Predator-Prey is `adversaries`, which adversary= trains; elsewhere it is `agents`."""
     for env, algo, adversary in [
         (env, algo, adversary)
@@ -47,7 +48,7 @@ def test_competitive_from_run_directories(tmp_path):
         if algo == adversary == "matd3":  # the same without a word
             overrides = overrides[:2] + overrides[3:]
         fake_run(tmp_path / "runs" / f"{env}-{algo}-vs-{adversary}", [*overrides, "eval_every=0"], columns)
-    out = tmp_path / "out"
+    out, figures = tmp_path / "out", pictures.written(monkeypatch)
     argv = ["train=false", f"runs={tmp_path / 'runs'}", f"out={out}", "only=nothing"]
     claims = {claim.paper.split(":")[0]: claim for claim in study.run(competitive.STUDY, argv)}
     assert [claim.verdict for claim in claims.values()] == ["same", "not yet run", "same", "opposite"]
@@ -62,7 +63,23 @@ def test_competitive_from_run_directories(tmp_path):
     assert "Departs from the paper's protocol: seeds 4 (20)" in text
     assert "Not yet run: simple_adversary-matd3-vs-matd3" in text
     assert "| Predator-Prey | MATD3 | MADDPG | 4 | 50,000 |" in text
-    assert (out / "figure.png").stat().st_size > 10_000
+    axes = figures[out / "figure.png"].axes
+    assert [axis.get_title() for axis in axes] == ["Covert Communication", "Keep-away", "Predator-Prey"]
+    matd3, maddpg = "#0072B2", "#E69F00"
+    for axis in axes:
+        # Both pairings of a MATD3 team, then those of MADDPG: normalized 7 / 8 and 1 / 8, with a dot for each seed.
+        place, height, color = zip(*pictures.bars(axis), strict=True)
+        np.testing.assert_allclose(place, range(4))
+        np.testing.assert_allclose(height, [7 / 8, 7 / 8, 1 / 8, 1 / 8])
+        assert color == (matd3, matd3, maddpg, maddpg)
+        dots = [line.get_ydata() for line in axis.lines if line.get_marker() == "."]
+        np.testing.assert_allclose(dots, [(mean + NOISE - 3) / 8 for mean in (10, 10, 4, 4)])
+        assert [label.get_text() for label in axis.get_xticklabels()] == ["vs\nMATD3", "vs\nMADDPG"] * 2
+        assert [(text.get_text(), text.get_color()) for text in axis.texts] == [
+            ("MATD3 team", matd3), ("MADDPG team", maddpg)]  # fmt: skip
+        assert axis.get_xlabel() == "4 seeds"
+    assert axes[0].get_ylabel() == "team's final return, normalized"
+    assert {matd3, maddpg} <= pictures.colors(out / "figure.png")
     # The same again from the data alone, and the numbers are in the table.
     shutil.rmtree(tmp_path / "runs")
     assert [c.difference for c in study.run(competitive.STUDY, argv)] == [c.difference for c in claims.values()]
@@ -214,7 +231,8 @@ def test_runs_with_other_settings_are_refused(tmp_path):
         grid_search.main(["task=ant", "scale=small"])
 
 
-def test_training_from_the_command(tmp_path, quick_jit):
+@pytest.mark.slow
+def test_training_from_the_command(tmp_path):
     """A study trains a setting, reports it, and the next time uses it as it is."""
     argv = ["scale=small", "only=simple_spread-maddpg", "seeds=2", "total_steps=1000", "algo.hidden=[8]",
             "log_every=200", "batch_size=16", "learning_starts=200", "replay_capacity=1000"]  # fmt: skip

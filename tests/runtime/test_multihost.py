@@ -1,7 +1,6 @@
 """Several processes: who they are, what they tell each other, and that a run of theirs is that of one process."""
 
 import csv
-import functools
 import json
 import os
 import re
@@ -36,12 +35,6 @@ TINY = [
     "log_every=100", "replay_capacity=500", "eval_every=300", "eval_episodes=3",
 ]  # fmt: skip
 SEVEN = [*TINY, "seeds=7", "checkpoint_every=0"]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quick(quick_jit):
-    """Every program of this module, those of its processes too, compiles with little optimization."""
-
 
 # ---- who the processes are -------------------------------------------------------------------------------------------
 
@@ -251,11 +244,8 @@ def test_nothing_is_written_where_one_process_cannot_train(tmp_path, monkeypatch
 # ---- a run and a sweep -----------------------------------------------------------------------------------------------
 
 WORKER = """
-import functools, json, os, signal, sys
-import jax, optax
-options, stop, *arguments = sys.argv[1:]
-if options:
-    jax.jit = functools.partial(jax.jit, compiler_options=json.loads(options))
+import os, signal, sys
+stop, *arguments = sys.argv[1:]
 from matd3_jax.cli import command, train
 from matd3_jax.training.session import TrainingSession
 advance = TrainingSession.advance
@@ -293,17 +283,21 @@ def alone(tmp_path_factory) -> Path:
     return out / "run"
 
 
-def test_two_processes_make_the_run_of_one(alone, tmp_path, quickly_compiled):
+@pytest.mark.slow
+def test_two_processes_make_the_run_of_one(alone, tmp_path):
     """Four seeds on three devices and three on one; SIGTERM to the second alone. Both stop with one checkpoint, each
     having written its part; this process resumes from it, to the run of one device."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         address = f"127.0.0.1:{free.getsockname()[1]}"
-    options = quickly_compiled.keywords["compiler_options"] if isinstance(quickly_compiled, functools.partial) else ""
-    places = ({"XLA_FLAGS": "--xla_force_host_platform_device_count=3"}, {"JAX_NUM_CPU_DEVICES": "1"})
-    clean = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "JAX_NUM_CPU_DEVICES")}
+    flags = " ".join(flag for flag in os.environ["XLA_FLAGS"].split() if "device_count" not in flag)
+    places = (
+        {"XLA_FLAGS": f"{flags} --xla_force_host_platform_device_count=3"},
+        {"XLA_FLAGS": flags, "JAX_NUM_CPU_DEVICES": "1"},
+    )
+    clean = {name: value for name, value in os.environ.items() if name != "JAX_NUM_CPU_DEVICES"}
     workers = [
         subprocess.Popen(
-            [sys.executable, "-c", WORKER, options and json.dumps(options), "500" if index else "", *SEVEN,
+            [sys.executable, "-c", WORKER, "500" if index else "", *SEVEN,
              f"out={tmp_path}", "name=run", f"coordinator_address={address}", "num_processes=2",
              f"process_id={index}"],
             env=clean | place, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
@@ -347,6 +341,7 @@ def leaves(run: Path) -> dict[str, np.ndarray]:
     return {name: np.asarray(leaf) for name, leaf in found.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", range(3))
 def test_any_number_of_processes_reads_a_checkpoint_of_one(alone, index):
     run, settings = RunDirectory.open(alone)
@@ -377,6 +372,7 @@ class OneAtATime(ocp.StandardCheckpointer):
             self.lock.release()
 
 
+@pytest.mark.slow
 def test_a_sweep_shares_the_seeds_of_each_batch(tmp_path, monkeypatch):
     """Two processes: a batch of two runs, with three seeds (the third in the second process) and with one, and a batch
     of one seed, which the second process sits out. The same runs as in one process."""

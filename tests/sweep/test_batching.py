@@ -101,6 +101,7 @@ def test_packing_takes_no_more_batches_than_needed():
 # ---- memory ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "more",
     [
@@ -108,13 +109,12 @@ def test_packing_takes_no_more_batches_than_needed():
         ["seeds=2", "n_step=3", "diagnostics.q_bias=true", "normalize_observations=true"],
     ],
 )
-def test_the_computed_memory_covers_the_compiled_program(quickly_compiled, monkeypatch, more):
+def test_the_computed_memory_covers_the_compiled_program(more):
     """Arguments and temporaries that XLA reserves for the interval lie below what is computed beforehand, and the
     replay is most of both where it is large."""
     training = TrainingSession(load("replay_capacity=20000", "total_steps=20000", *more))
     trainer, seeds = training.trainer, len(training.seeds)
     state = jax.eval_shape(trainer.init, jax.eval_shape(training.keys))
-    monkeypatch.setattr(jax, "jit", quickly_compiled)
     analysis = training.interval.jitted.lower(state, trainer.hyper).compile().memory_analysis()
     used = trainer.mesh.size * (analysis.argument_size_in_bytes + analysis.temp_size_in_bytes)
     computed = memory.needed(trainer, seeds) - memory.PROCESS

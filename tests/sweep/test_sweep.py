@@ -8,11 +8,14 @@ import signal
 from pathlib import Path
 
 import numpy as np
+import pictures
 import pytest
 
 from matd3_jax import config
 from matd3_jax.cli import sweep, train
 from matd3_jax.errors import UserError
+from matd3_jax.figures import sweep as figure
+from matd3_jax.figures.sweep import BEST
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.sweep import launcher, ranking, runner
 from matd3_jax.sweep.runner import Batch, Sweep
@@ -26,11 +29,6 @@ TINY = [
     "eval_episodes=3",
 ]  # fmt: skip
 SWEPT = ["algo.lr=0.01,0.1", "algo.tau=0.01,0.5"]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quick(quick_jit):
-    """Every program of this module compiles with little optimization."""
 
 
 def leaves(run: Path) -> dict[str, np.ndarray]:
@@ -54,6 +52,7 @@ def test_one_batch_holds_what_shares_a_program(swept):
     assert len(Sweep(swept).batches) == 1 and len(Sweep(swept).batches[0]) == 4
 
 
+@pytest.mark.slow
 def test_each_member_equals_the_same_run_made_alone(swept, tmp_path):
     """Metrics, networks, optimizers, environments and keys of one member, against a run of its settings."""
     assert train.main([*TINY, "algo.lr=0.1", "algo.tau=0.01", "seeds=2", f"out={tmp_path}", "name=alone"]) == 0
@@ -93,15 +92,19 @@ def test_a_member_can_be_evaluated_but_not_gone_on_with(swept):
         train.main([f"resume={swept / 'runs' / 'lr_0.1-tau_0.01'}", "total_steps=1000"])
 
 
-def test_the_table_ranks_by_the_mean_of_the_last_tenth(swept):
-    """Against the metrics tables, read and averaged by hand."""
-    expected = {}
+def test_the_table_ranks_by_the_mean_of_the_last_tenth(swept, tmp_path, monkeypatch):
+    """Against the metrics tables, read and averaged by hand; and the picture shows them."""
+    expected, curves = {}, {}
     for path in (swept / "runs").iterdir():
         with (path / "metrics.csv").open(newline="") as file:
             rows = list(csv.DictReader(file))
         last = max(int(row["step"]) for row in rows)
         late = [float(row["return_agents"]) for row in rows if int(row["step"]) > 0.9 * last]
         expected[path.name] = sum(late) / len(late)
+        steps = sorted({int(row["step"]) for row in rows})
+        curves[path.name] = [
+            np.mean([float(row["return_agents"]) for row in rows if int(row["step"]) == step]) for step in steps
+        ]
     with (swept / "table.csv").open(newline="") as file:
         table = list(csv.DictReader(file))
     assert [row["setting"] for row in table] == sorted(expected, key=expected.get, reverse=True)
@@ -111,7 +114,22 @@ def test_the_table_ranks_by_the_mean_of_the_last_tenth(swept):
         assert row["setting"] == f"lr_{row['algo.lr']}-tau_{row['algo.tau']}"
     with (swept / "seeds.csv").open(newline="") as file:
         assert len(list(csv.DictReader(file))) == 8
-    assert (swept / "sweep.png").read_bytes()[:4] == b"\x89PNG"
+    assert {BEST[k] for k in range(4)} <= pictures.colors(swept / "sweep.png")
+    figures, facts = pictures.written(monkeypatch), json.loads((swept / "sweep.json").read_text())
+    ranked = ranking.rank(swept / "runs", facts["runs"], facts["settings"], "return_agents")
+    figure.draw(tmp_path / "again.png", swept / "runs", facts["runs"], ranked, "return_agents")
+    top, rate, tau = figures[tmp_path / "again.png"].axes
+    drawn = pictures.lines(top)
+    assert drawn.keys() == {f"{k + 1}: {row['setting']}" for k, row in enumerate(table)}
+    for label, line in drawn.items():
+        np.testing.assert_allclose(line, [steps, curves[label[3:]]], rtol=1e-5)
+    finals = [expected[row["setting"]] for row in table]
+    for axis, key in ((rate, "algo.lr"), (tau, "algo.tau")):
+        values = sorted({row[key] for row in table}, key=float)
+        assert axis.get_xlabel() == key and [label.get_text() for label in axis.get_xticklabels()] == values
+        every, best = (c.get_offsets() for c in axis.collections if type(c).__name__ == "PathCollection")
+        np.testing.assert_allclose(every, [(values.index(row[key]), f) for row, f in zip(table, finals, strict=True)])
+        np.testing.assert_allclose(best, every[:1])
 
 
 def test_diverged_seeds_are_counted_and_come_last(swept, tmp_path):
@@ -147,6 +165,7 @@ def test_a_sweep_that_diverged_everywhere_is_reported(swept, tmp_path):
         assert [row["diverged"] for row in csv.DictReader(file)] == ["2"] * 4
 
 
+@pytest.mark.slow
 def test_stopped_and_resumed_it_is_the_same_sweep(swept, tmp_path, monkeypatch, capsys):
     """A signal after the third interval; it is resumed, to the same numbers."""
     advance, calls = TrainingSession.advance, []
@@ -169,6 +188,7 @@ def test_stopped_and_resumed_it_is_the_same_sweep(swept, tmp_path, monkeypatch, 
     assert not (tmp_path / "cut" / "batches" / "0").exists()  # its checkpoints, replays in them, are of no more use
 
 
+@pytest.mark.slow
 def test_batches_are_jobs_of_their_own_and_cut_by_memory(swept, tmp_path, monkeypatch, capsys):
     """With memory for two seeds: two batches, trained apart, the same table in the end. What one process works at,
     another leaves alone."""

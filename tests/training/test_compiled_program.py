@@ -19,10 +19,10 @@ IN_PLACE = {"parameter", "get-tuple-element", "tuple", "bitcast", "dynamic-updat
 """What gives out an array of the replay's size without writing all of it."""
 
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
+CASES = [pytest.param((1, 1), marks=pytest.mark.slow), (2, 1), pytest.param((2, 3), marks=pytest.mark.slow)]
 
 
-@pytest.fixture(scope="module", params=[(1, 1), (2, 1), (2, 3)], ids="seeds={0[0]} n_step={0[1]}".format)
+@pytest.fixture(scope="module", params=CASES, ids="seeds={0[0]} n_step={0[1]}".format)
 def trainer(request):
     """Of one seed or two on one device: their loops are compiled differently."""
     env = make("point_reach", dim=1)

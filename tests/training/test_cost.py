@@ -4,6 +4,7 @@ import re
 from types import SimpleNamespace
 
 import jax
+import numpy as np
 import pytest
 
 from benchmarks import limits
@@ -59,21 +60,71 @@ def test_one_after_another_each_agent_runs_the_target_actors():
     assert flops[0] < flops[1] == flops[2]
 
 
-def test_a_rate_is_measured():
-    """Larger products are done at a higher rate than tiny ones, and none faster than a core can."""
-    devices = tuple(jax.local_devices())
-    tiny, large = (cost.product_rate(devices, *shape) for shape in ((4, 3, 2), (256, 128, 128)))
-    assert 0 < tiny < large < 1e12 * len(devices)
+@pytest.fixture
+def timed(monkeypatch):
+    """What is timed is run three times and then said to have taken half a second; the programs, and what they gave."""
+    ran = []
+
+    def repeated(program, wanted):
+        ran.append((program, np.asarray(program(3))))
+        return 3, 0.5
+
+    monkeypatch.setattr(cost, "_repeated", repeated)
+    return ran
 
 
-@pytest.mark.parametrize(("name", "physics"), [("ant", "c"), ("hopper", "c"), ("ant", "mjx_fast"), ("ant", "mjx")])
-def test_physics(name, physics):
-    """Measured for C MuJoCo, also behind a joint team; a constant for MJX."""
-    found = training(*ANT, f"env={name}", f"env.physics={physics}", "algo=td3")
+def test_the_rate_of_products(timed):
+    """Each repetition is a product with the batch and one with its transpose, on each device: as many operations as
+    are divided by the time, and none left out by the compiler."""
+    devices, (batch, inputs, outputs) = tuple(jax.local_devices()), (7, 5, 3)
+    rate = cost.product_rate(devices, batch, inputs, outputs)
+    assert rate == 3 * len(devices) * (2 * 2 * batch * inputs * outputs) / 0.5
+    ((_, kernels),) = timed
+    x, kernel = (np.full(shape, 0.01) for shape in ((batch, inputs), (inputs, outputs)))
+    for _ in range(3):
+        kernel = kernel - 1e-3 * (x.T @ (x @ kernel))
+    np.testing.assert_allclose(kernels, [kernel] * len(devices), rtol=1e-6)
+    assert not np.allclose(kernels, 0.01, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("name", ["ant", "hopper"])
+def test_the_rate_of_c_physics(name, timed):
+    """Env steps of all robots of one device, also behind a joint team; each was really stepped, and differently."""
+    found = training(*ANT, f"env={name}", "env.physics=c", "algo=td3")
     devices = tuple(jax.local_devices())
-    rate = cost.physics_rate(found.env, devices, 4)
-    assert rate == cost.MJX_STEPS[physics] if physics != "c" else 100 < rate < 1e6
+    assert cost.physics_rate(found.env, devices, 4) == 3 * 4 / 0.5
+    ((program, thrice),) = timed
+    once = np.asarray(program(1))
+    robot = cost.innermost(found.env)
+    assert thrice.shape == (len(devices), 4, robot.mj_model.nq)
+    for before, after in ((robot.mj_model.qpos0, once), (once, thrice)):
+        assert (np.abs(after - before).max(axis=-1) > 0).all()
+    assert len(np.unique(thrice[0], axis=0)) == 4
+
+
+@pytest.mark.parametrize("physics", ["mjx_fast", "mjx"])
+def test_the_rate_of_other_physics_is_known(physics, timed):
+    devices = tuple(jax.local_devices())
+    env = training(*ANT, f"env.physics={physics}", "algo=td3").env
+    assert cost.physics_rate(env, devices, 4) == cost.MJX_STEPS[physics]
     assert cost.physics_rate(training("env=simple_spread").env, devices, 4) is None
+    assert not timed
+
+
+def test_what_is_timed(monkeypatch):
+    """Repetitions and seconds of whole calls, long enough each to be timed, and without the first, which compiles."""
+    now, calls = [0.0], []
+    monkeypatch.setattr(cost, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+
+    def program(count):
+        now[0] += 2**-10 * count + (0 if calls else 60)
+        calls.append(count)
+
+    count, taken = cost._repeated(program, 1.0)
+    timed = [n for n in calls if n == calls[-1]]
+    # Calls of 1, 4, 16 and 64 repetitions take less than a tenth of a second.
+    assert calls[:5] == [1, 1, 4, 16, 64] and calls[-1] == 256
+    assert count == sum(timed[1:]) == 1024 and taken == 2**-10 * count
 
 
 def test_the_expectation_by_hand(monkeypatch):

@@ -21,8 +21,6 @@ SMALL = {
     "log_every": CHUNK, "replay_capacity": 1200, "eval_episodes": EPISODES,
 }  # fmt: skip
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 
 def train(**options):
     return matd3_jax.train("algo.hidden=[8]", env=Ledger(), **{**SMALL, **options})
@@ -86,6 +84,7 @@ def test_episodes_by_hand():
     assert np.ptp(found.episode_return[:, 0, 0]) > 1e-3, "seeds have policies of their own"
 
 
+@pytest.mark.slow
 def test_deterministic_evaluations_play_the_averaged_actors():
     """With `actor_average` an evaluation is that of the averages, put in the actors' place; sampled ones are not."""
     result = matd3_jax.train("algo.hidden=[8]", "algo.actor_average=0.2", env=Ledger(), **SMALL)
@@ -136,6 +135,7 @@ def test_columns():
         np.testing.assert_array_equal(table[f"eval_return_{team}"], table[f"agent_{i}_eval_return"])
 
 
+@pytest.mark.slow
 def test_start_states_are_fixed():
     """The same episodes at every evaluation, for every seed and in runs of other training keys: curves differ by the
     policies alone. Episodes of one evaluation differ among themselves."""

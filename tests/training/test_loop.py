@@ -24,8 +24,6 @@ MADDPG = Algorithm(name="maddpg", hidden=(4,), num_critics=1, policy_delay=1)
 SCHEDULE = Schedule(num_envs=3, rollout_length=4, batch_size=8, replay_capacity=60, learning_starts=36)
 SEEDS = 3
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 
 def make(seeds, schedule=SCHEDULE, delays=(2, 1), env=None, tau=0.1, **options):
     """A trainer of Ledger with one team an agent: MATD3-like for the first, MADDPG-like for the others."""
@@ -224,15 +222,12 @@ def test_moves(monkeypatch, delays, updates):
     assert got == want
 
 
-@pytest.mark.parametrize("delays, updates", [((2, 2), 3), ((3, 1), 2)])
-def test_moves_where_delay_and_updates_do_not_fit(monkeypatch, delays, updates):
-    """The same where neither of delay and updates_per_collect divides the other; a ValueError would do, too."""
-    try:
-        got, want = moves(monkeypatch, delays, updates)
-    except ValueError as error:
-        assert "policy_delay" in str(error)
-    else:
-        assert got == want
+@pytest.mark.parametrize("delays, updates, delay", [((2, 2), 3, 2), ((3, 1), 2, 3), ((1, 4), 6, 4)])
+def test_delay_and_updates_that_do_not_fit_are_refused(delays, updates, delay):
+    """Where neither of delay and updates_per_collect divides the other, for any of the teams."""
+    message = f"updates_per_collect={updates} and policy_delay={delay}: one must divide the other"
+    with pytest.raises(ValueError, match=message):
+        make([0], dataclasses.replace(SCHEDULE, updates_per_collect=updates), delays)
 
 
 @pytest.mark.parametrize("shared", [False, True])
@@ -266,6 +261,7 @@ def same(one, other, seeds_one, seeds_other):
     assert one.rollouts == other.rollouts
 
 
+@pytest.mark.slow
 def test_seed_alone():
     """Seed 1 with its own hyper-parameters by itself gives what it gives among three."""
     trainer = make([1], tau=1.0)
@@ -276,6 +272,7 @@ def test_seed_alone():
     assert np.abs(first - second).max() > 1e-3, "the seeds themselves differ"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(len(jax.devices()) < 2, reason="one device")
 def test_devices_and_pieces_and_chunks_and_unrolling():
     """An odd number of seeds on one device, updated together, in one long interval whose loops hold several iterations
@@ -290,6 +287,7 @@ def test_devices_and_pieces_and_chunks_and_unrolling():
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), plain(long), short)
 
 
+@pytest.mark.slow
 def test_seeds_apart(monkeypatch):
     """Networks of each seed in arrays of their own inside the program, as for large ones: the same numbers, in the same
     form."""
@@ -304,6 +302,7 @@ def test_seeds_apart(monkeypatch):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), plain(long), short)
 
 
+@pytest.mark.slow
 def test_devices_that_share_a_seed():
     """One seed on two devices, half of each minibatch on each: as on one, and the same on both devices."""
     trainer = make([1], dataclasses.replace(SCHEDULE, batch_size=6), tau=1.0)

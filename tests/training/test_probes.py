@@ -20,6 +20,8 @@ from matd3_jax.envs import Box, Environment, Simplex, TimeStep
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.schedule import Schedule
 
+pytestmark = pytest.mark.slow
+
 GAMMA = 0.8
 ALGORITHMS = {
     "matd3": Algorithm(hidden=(16,), clip="none"),
@@ -41,8 +43,6 @@ HYPER = HYPER._replace(
 CRITICS, ACTORS = 0, 1
 N_STEP = {"matd3-3-step": ("matd3", 3)}
 """Values of returns over several steps: the policies that the critics judge stay as they are, so they are the same."""
-
-pytestmark = pytest.mark.usefixtures("quick_jit")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,9 +11,18 @@ import pytest
 import matd3_jax
 from matd3_jax.training import clock, progress
 from matd3_jax.training.clock import Clock
+from matd3_jax.training.loop import Program
 from matd3_jax.training.session import TrainingSession
 
 NAN = np.full(2, np.nan)
+
+
+@pytest.fixture
+def now(monkeypatch):
+    """The time [1] on the clock of a run, which stands still."""
+    seconds = [100.0]
+    monkeypatch.setattr(clock, "time", SimpleNamespace(monotonic=lambda: seconds[0]))
+    return seconds
 
 
 @pytest.fixture
@@ -110,13 +119,27 @@ def test_rates_are_the_trainings(begin, capsys):
 def test_compiling_is_noticed():
     """By JAX's own reports; a part is not counted besides the whole that it belongs to."""
     before, begun = clock.compiling(), time.monotonic()
-    jax.jit(lambda x: jnp.where(x > 0, jax.nn.softmax(x @ x), jnp.sin(x)).sum())(jnp.ones((17, 17)))
-    assert 0 < clock.compiling() - before <= time.monotonic() - begun
+    program = jax.jit(lambda x: jnp.where(x > 0, jax.nn.softmax(x @ x), jnp.sin(x)).sum())
+    program(np.ones((17, 17), np.float32))
+    compiled = clock.compiling()
+    assert 0 < compiled - before <= time.monotonic() - begun
+    program(np.zeros((17, 17), np.float32))
+    assert clock.compiling() == compiled
+
+
+def test_compiling_is_left_out(now, monkeypatch):
+    """Of what training and evaluations take; together they are what was spent in the run."""
+    monkeypatch.setattr(clock, "_compiled", [])
     counted = Clock()
     with counted.train():
-        time.sleep(0.05)
-        jax.jit(lambda x: jnp.cos(x @ x) + 2)(jnp.ones((13, 13)))
-    assert 0.05 <= counted.training < 0.5
+        now[0] += 5
+        clock._note("/jax/core/compile/any", 3)
+        now[0] += 0.5
+    with counted.evaluate():
+        now[0] += 7
+        clock._note("/jax/core/compile/any", 1)
+    now[0] += 100
+    assert (counted.training, counted.evaluation, counted.evaluations) == (2.5, 6, 1)
 
 
 def test_nested_reports_count_once(monkeypatch):
@@ -128,16 +151,19 @@ def test_nested_reports_count_once(monkeypatch):
     assert clock.compiling() == 6 + 3
 
 
-def test_a_run_counts_its_evaluations(quickly_compiled, monkeypatch):
-    """As many as have numbers in the table and as were expected; a slow one is no training."""
-    monkeypatch.setattr(jax, "jit", quickly_compiled)
-    evaluate = TrainingSession.evaluate
+def test_a_run_counts_its_evaluations(now, monkeypatch):
+    """As many as have numbers in the table and as were expected; what an evaluation takes is no training."""
+    monkeypatch.setattr(clock, "compiling", lambda: 0.0)
 
-    def slow(self, *args, **options):
-        time.sleep(0.2)
-        return evaluate(self, *args, **options)
+    def takes(seconds, function):
+        def slow(*args, **options):
+            now[0] += seconds
+            return function(*args, **options)
 
-    monkeypatch.setattr(TrainingSession, "evaluate", slow)
+        return slow
+
+    monkeypatch.setattr(TrainingSession, "evaluate", takes(8, TrainingSession.evaluate))
+    monkeypatch.setattr(Program, "__call__", takes(3, Program.__call__))
     left = []
     result = matd3_jax.train(
         "algo.hidden=[8]", env="simple", seeds=2, num_envs=2, batch_size=8, learning_starts=100, total_steps=1000,
@@ -148,8 +174,8 @@ def test_a_run_counts_its_evaluations(quickly_compiled, monkeypatch):
     assert evaluated.sum() == training.clock.evaluations >= 5
     for interval, step in enumerate(left):
         assert training.evaluations_after(step) == evaluated[interval + 1 :].sum()
-    assert training.clock.evaluation > 0.2 * training.clock.evaluations
-    assert 0 < training.clock.training < 0.2 * training.clock.evaluations
+    assert training.clock.evaluation == 8 * training.clock.evaluations
+    assert training.clock.training == 3 * len(left[1:])
 
 
 def test_seconds_as_people_read_them():

@@ -19,7 +19,7 @@ TASKS = (
 
 def still(env, frames=1, **changes):
     """A start state of a particle task with some fields changed, repeated."""
-    state, _ = env.reset(jax.random.key(0))
+    state, _ = jax.jit(env.reset)(jax.random.key(0))
     state = state._replace(**{name: jnp.asarray(value) for name, value in changes.items()})
     return jax.tree.map(lambda leaf: jnp.stack([leaf] * frames), state)
 
@@ -203,11 +203,12 @@ def test_every_task_is_drawn_and_explained(name):
     """As many pictures as states, all different where all move; every color of the legend is seen."""
     env = make(name)
     keys = jax.random.split(jax.random.key(1), 4)
-    state, _ = env.reset(keys[0])
-    states = [state]
+    state, _ = jax.jit(env.reset)(keys[0])
+    states, step = [state], jax.jit(env.step)
+    sample = jax.jit(lambda key: tuple(space.sample(key) for space in env.action_spaces))
     for key in keys:
-        action = tuple(space.sample(key) for space in env.action_spaces)
-        states.append(env.step(key, states[-1], action).state)
+        action = sample(key)
+        states.append(step(key, states[-1], action).state)
     images = draw(env, jax.tree.map(lambda *leaves: jnp.stack(leaves), *states))
     assert len(images) == 5
     assert all(np.any(a != b) for a, b in zip(images, images[1:], strict=False))

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import types
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -13,8 +14,6 @@ from matd3_jax.envs import make
 from matd3_jax.errors import UserError
 from matd3_jax.figures.style import BLUE, VERMILION
 from matd3_jax.video import frames, mujoco_renderer, opengl
-
-mujoco = pytest.importorskip("mujoco")
 
 XML = """
 <mujoco>
@@ -163,7 +162,6 @@ def test_without_opengl_one_line_says_what_to_install(variables, wanted):
 
 @pytest.mark.parametrize("name", ["ant", "swimmer", "brax_half_cheetah"])
 def test_real_robots_show_every_agent(gl, name):
-    pytest.importorskip("brax" if name.startswith("brax") else "mujoco.mjx")
     env = make(name)
     (image,) = draw(env, [env.mj_model.qpos0])
     for agent in range(len(env.agents)):
@@ -172,7 +170,6 @@ def test_real_robots_show_every_agent(gl, name):
 
 def test_an_opengl_that_mujoco_does_not_know_is_one_line_of_the_command(tmp_path):
     """Here MuJoCo cannot even be imported, hence the environment not be made."""
-    pytest.importorskip("brax")
     config.write(config.load(["env=brax_hopper"]), tmp_path / "config.yaml")
     words = [sys.executable, "-m", "matd3_jax.render", f"run={tmp_path}"]
     done = subprocess.run(words, env={**os.environ, "MUJOCO_GL": "vulkan"}, capture_output=True, text=True)

@@ -67,6 +67,16 @@ def make(name: str, **options_: Any) -> Environment:
     """The environment called `name`.
 
     Raises OptionError (a ValueError) for an unknown name, an unknown option, or an impossible value.
+
+    Example:
+        >>> import jax
+        >>> env = make("simple_spread", num_agents=2)
+        >>> env.agents, env.observation_sizes
+        (('agent_0', 'agent_1'), (12, 12))
+        >>> state, observations = env.reset(jax.random.key(0))
+        >>> actions = tuple(jax.numpy.full(space.size, 1 / space.size) for space in env.action_spaces)
+        >>> env.step(jax.random.key(1), state, actions).reward.shape
+        (2,)
     """
     known = options(name)
     for key in options_:

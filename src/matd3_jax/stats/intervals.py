@@ -42,6 +42,13 @@ def mean_interval(values: np.ndarray, axis: int = 0, confidence: float = 0.95) -
     """Mean over `axis` (seeds) and the half width of its confidence interval (Student's t), for any other axes at once.
 
     Raises ValueError without seeds or with an impossible confidence.
+
+    Example:
+        Three seeds of returns at two points of a curve; Student's quantile of 2 degrees of freedom is 4.303.
+
+        >>> mean, half = mean_interval(np.array([[1.0, 10.0], [2.0, 10.0], [3.0, 10.0]]))
+        >>> mean.tolist(), half.round(3).tolist()
+        ([2.0, 10.0], [2.484, 0.0])
     """
     values = samples(values, axis, confidence)
     n, mean = len(values), values.mean(axis=0)
@@ -72,6 +79,11 @@ def compare(a: np.ndarray, b: np.ndarray, paired: bool = False, confidence: floa
 
     Raises:
         ValueError: no seeds, shapes that do not go together, impossible confidence.
+
+    Example:
+        >>> found = compare(np.array([3.0, 4.0, 5.0]), np.array([1.0, 1.5, 2.0, 1.5]))
+        >>> float(found.difference), bool(found.clear)
+        (2.5, True)
     """
     a, b = samples(a, 0, confidence), samples(b, 0, confidence)
     if a.shape[1:] != b.shape[1:]:

@@ -65,11 +65,12 @@ def train(
     (`envs.check`).
 
     Example:
-        >>> import matd3_jax
-        >>> tiny = dict(total_steps=400, learning_starts=200, batch_size=16, num_envs=2, rollout_length=5)
-        >>> result = matd3_jax.train(env="point_reach", seeds=2, replay_capacity=400, **tiny)
-        >>> result.metrics["step"].shape[0], result.evaluate(episodes=3).shape
-        (2, (2, 3, 2))
+        >>> small = dict(total_steps=300, learning_starts=100, batch_size=16, log_every=100, eval_every=0)
+        >>> result = train("algo.hidden=[8]", env="simple_spread", algo="matd3", seeds=2, num_envs=2, **small)
+        >>> result.metrics["step"][0].tolist()
+        [50, 150, 250, 350]
+        >>> result.metrics["return_agents"].shape, result.evaluate(episodes=3).shape
+        ((2, 4), (2, 3, 3))
     """
     devices.prepare()
     own = None if isinstance(env, str) else env

@@ -4,6 +4,7 @@ import csv
 import json
 
 import numpy as np
+import pictures
 import pytest
 
 from experiments import ant
@@ -36,7 +37,8 @@ def runs(tmp_path):
     return folder
 
 
-def test_report(runs, tmp_path, capsys):
+def test_report(runs, tmp_path, monkeypatch):
+    figures = pictures.written(monkeypatch)
     out = tmp_path / "out"
     assert ant.main(["algos=[matd3,td3,iltd3]", "train=false", f"runs={runs}", f"out={out}"]) == 0
     with (out / "curves.csv").open(newline="") as file:
@@ -59,7 +61,25 @@ def test_report(runs, tmp_path, capsys):
     assert facts["matd3"]["summary"] == "not finished"
     assert facts["td3"]["summary"] == {"total_steps": 40}
     assert facts["td3"]["settings"]["algo"]["joint"] is True
-    assert (out / "curves.png").stat().st_size > 10_000
+    returns, velocity = figures[out / "curves.png"].axes
+    matd3, td3 = "#0072B2", "#CC79A7"
+    # Mean and standard deviation of 1 and 3 times the env step, 2 and sqrt(2) times.
+    step = np.array([0, 20, 40])
+    for axis, scale in ((returns, 1), (velocity, 100)):
+        drawn, bands = pictures.lines(axis), pictures.bands(axis)
+        assert list(drawn) == ["MATD3 (2 seeds)", "SA-TD3 (2 seeds)"]
+        assert [line.get_color() for line in axis.lines[:2]] == [matd3, td3]
+        for curve, band, level in zip(drawn.values(), bands, (0, 500), strict=True):
+            np.testing.assert_allclose(curve, [step, (2 * step + level) / scale])
+            ends = (2 + np.sqrt(2) * np.array([[-1], [1]])) * step + level
+            np.testing.assert_allclose(band, [step, *ends / scale])
+        assert axis.get_xlabel() == "env steps of each seed"
+    labels = ["evaluation: return", "evaluation: forward velocity (m/s)"]
+    assert [axis.get_ylabel() for axis in (returns, velocity)] == labels
+    assert [text.get_text() for text in returns.texts] == ["standing still"] and not velocity.texts
+    np.testing.assert_array_equal(returns.lines[2].get_ydata(), [1000, 1000])
+    assert figures[out / "curves.png"].get_suptitle() == "ant: mean ± sd over seeds"
+    assert {matd3, td3} <= pictures.colors(out / "curves.png")
 
 
 def test_bad_input_is_named(tmp_path):

@@ -9,11 +9,10 @@ from matd3_jax import config
 from matd3_jax.training import checkpoint
 from matd3_jax.training.session import TrainingSession
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 SMALL = ("algo.hidden=[16]", "learning_starts=80", "replay_capacity=1000", "env.episode_length=20", "eval_episodes=2")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("physics", ["c", "mjx_fast"])
 def test_the_ant_trains_and_is_evaluated(physics):
     result = matd3_jax.train(
@@ -62,6 +61,7 @@ OPTIONS = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("env", "seeds"), [("ant", 3), ("humanoid", 1)])
 def test_a_resumed_robot_goes_on_to_the_bit(env, seeds, tmp_path):
     """With C physics, whatever carries state: the solver's start, noise quantiles, averaged actors, the reservoir."""
