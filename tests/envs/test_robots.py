@@ -94,7 +94,7 @@ def cases():
             yield pytest.param(name, physics, marks=[pytest.mark.slow] * slow, id=f"{physics}-{name}")
 
 
-@pytest.mark.parametrize(("name", "physics"), cases())
+@pytest.mark.parametrize(("name", "physics"), [*cases()])
 def test_steps_are_those_of_gymnasium(name, physics):
     env = make(name, physics=physics, split="single")
     # The humanoid's model asks for PGS, which MJX lacks.
