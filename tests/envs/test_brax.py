@@ -60,7 +60,7 @@ def random_action(env, rng):
     return tuple(rng.uniform(-1, 1, space.size).astype(np.float32) for space in env.action_spaces)
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", [pytest.param(r, marks=[pytest.mark.slow] * (r != "ant")) for r in ROBOTS])
 def test_steps_are_brax_s_own(robot):
     """Reset and three steps with the same key and actions, in one program, so that nothing but our part can differ."""
     split = {"split": LEGS} if robot == "ant" else {}

@@ -26,13 +26,16 @@ HEARD = {"simple_reference": {0: (1,), 1: (0,)}, "simple_world_comm": {0: (0, 1)
 """Speaker -> those whose observation ends with its word."""
 
 
+CASES = ["soft", pytest.param("discrete", marks=pytest.mark.slow)]
+
+
 @functools.cache
 def trained(name):
     env, actions, options = RUNS[name]
     return matd3_jax.train(f"env.actions={actions}", "algo.hidden=[8]", *options, env=env, **SMALL)
 
 
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize("name", CASES)
 def test_what_is_played_is_what_is_heard(name):
     """Every stored action is valid part by part, and the word in it stands in the listeners' next observation."""
     result, env = trained(name), RUNS[name][0]
@@ -54,7 +57,7 @@ def test_what_is_played_is_what_is_heard(name):
             np.testing.assert_array_equal(layout.observation_part(parts.next_x, listener)[:, -word.shape[1] :], word)
 
 
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize("name", CASES)
 def test_updates_move_movement_and_word(name):
     """Updates move the actors in the columns of the movement and in those of the word, and losses are finite."""
     result = trained(name)
@@ -115,7 +118,7 @@ def test_move_and_word_are_learnt():
         assert (shares(result.state, seed) > 0.9).all()
 
 
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize("name", CASES)
 def test_deterministic_words(name):
     """Without noise the word is the softmax of its own logits, or the likeliest one, whatever the movement's are."""
     result, (env, actions, _) = trained(name), RUNS[name]
