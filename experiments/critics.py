@@ -13,6 +13,7 @@ from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
+from matd3_jax.figures.style import SERIES
 
 ROBOTS = {"ant": "halves", "half_cheetah": "2x3"}
 
@@ -70,7 +71,7 @@ def draw(table: Table, path: Path) -> None:
     there = [env for env in ROBOTS if any(len(part(table, env, name)) for name in CRITICS)]
     figure, axes = figures.canvas(len(there))
     for axis, env in zip(axes, there, strict=True):
-        for name, color in zip(CRITICS, figures.SERIES, strict=False):
+        for name, color in zip(CRITICS, SERIES, strict=False):
             rows = part(table, env, name)
             if len(rows):
                 evaluations.draw(axis, rows, evaluations.RETURN, color, name)

@@ -12,7 +12,7 @@ from benchmarks import compile_times, fresh, growth, growth_figure, guard, loop
 from benchmarks.loop import copies_in
 from matd3_jax import config
 from matd3_jax.errors import UserError
-from matd3_jax.figures.learning_curves import COLORS
+from matd3_jax.figures.style import SERIES
 from matd3_jax.training.session import TrainingSession
 
 
@@ -58,7 +58,7 @@ def test_exponents_and_figure(tmp_path, monkeypatch):
         for axis, values in ((above, 1000 * seconds), (below, megabytes)):
             assert axis.get_ylim()[0] < values.min() and values.max() < axis.get_ylim()[1]
     assert [axis.get_ylabel() for axis in columns[0]] == ["ms an iteration, all seeds", "MB"]
-    assert {COLORS[0].upper(), COLORS[1].upper(), COLORS[4].upper()} <= pictures.colors(path)
+    assert {SERIES[0], SERIES[1], SERIES[4]} <= pictures.colors(path)
 
 
 def test_points_of_the_growth_study_are_possible():

@@ -4,36 +4,28 @@ The blocks of docs/extending.md are run in test_extending.py.
 """
 
 import ast
+import dataclasses
 import fnmatch
 import importlib
 import importlib.util
 import re
 import shlex
+import typing
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 from documents import DOCUMENTS, blocks
 
+from experiments import all as all_studies
 from experiments import study
 from matd3_jax import config
+from matd3_jax.cli import arguments as arguments_of_commands
 from matd3_jax.cli import sweep
-from matd3_jax.runtime import slurm
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
-OWN = {
-    "matd3_jax.train": {"resume", "checkpoint", *slurm.KEYS},
-    "matd3_jax.sweep": {"resume", "batch", *sweep.OPTIONS, *slurm.KEYS},
-    "matd3_jax.plot": {"runs"},
-    "matd3_jax.crossplay": {"runs"},
-    "benchmarks.guard": {"record"},
-    "experiments.all": {"skip", *study.OPTIONS},
-    "experiments.cooperative_navigation": {"seeds", "total_steps", "out"},
-}
-"""Keys of commands that are neither settings of a run nor in the command's `DEFAULTS`."""
-CLOSED = ("evaluate", "render", "plot", "crossplay", "peers", "gpu")
-"""Commands that take no settings of a run."""
 PLACEHOLDER = re.compile(r"[A-Z][A-Z_,]*(/[\w.]+)?|\$\w+|value")
 """A value that stands for the reader's own."""
 
@@ -75,32 +67,44 @@ def test_command(command):
     assert spec is not None
     inner = f"{name}.__main__" if spec.submodule_search_locations else name
     assert importlib.util.find_spec(inner) is not None
+    given = [word for word in arguments if word not in ("key=value", "...", "--help", "--cfg")]
+    assert all("=" in word for word in given), given
+    if not given:
+        return
     short = name.split(".")[-1]
     module = importlib.import_module(f"matd3_jax.cli.{short}" if name.startswith("matd3_jax.") else inner)
-    own = OWN.get(name, set()) | set(getattr(module, "DEFAULTS", ()))
-    words = [word for word in arguments if word not in ("key=value", "...", "--help", "--cfg")]
-    assert all("=" in word for word in words), words
-    if isinstance(getattr(module, "STUDY", None), study.Study):
-        options, overrides = study.parse(module.STUDY, words)
-        settings = module.STUDY.settings(options["scale"], options)
-        assert fnmatch.filter(settings, options["only"] or "*"), f"only={options['only']}: none of {list(settings)}"
-        config.load([*next(iter(settings.values())), *overrides])
-        return
-    keys = {word.split("=")[0] for word in words}
-    if "resume" in keys:
-        assert keys <= own | {"total_steps", "metric"}
-        return
-    rest = [word for word in words if word.split("=")[0] not in own]
-    if short in CLOSED:
-        assert not rest, f"{name} has no {rest}"
-        return
-    rest = [word for word in rest if not PLACEHOLDER.fullmatch(word.split("=", 1)[1])]
-    if name == "matd3_jax.sweep":
-        chosen = [word for word in rest if not word.startswith("launcher.")]
-        samples = next((int(word.split("=")[1]) for word in words if word.startswith("samples=")), None)
-        assert sweep.read(chosen, samples, 0)[1]
+    is_study = isinstance(getattr(module, "STUDY", None), study.Study)
+    ours = arguments_of_commands.COMMANDS.get(short) if name.startswith("matd3_jax.") else None
+    command = ours or (module.STUDY.command if is_study else module.COMMAND)
+    options = command.parse(list(filter(None, (concrete(word, command) for word in given))))
+    fields = dataclasses.fields(options)
+    others = {field.name: getattr(options, field.name) for field in fields if "others" in field.metadata}
+    settings = [text for texts in others.values() for text in texts if not text.startswith("launcher.")]
+    if is_study:
+        lines = module.STUDY.settings(options.scale, options)
+        assert fnmatch.filter(lines, options.only or "*"), f"only={options.only}: none of {list(lines)}"
+        config.load([*next(iter(lines.values())), *settings])
+    elif name == "experiments.all":
+        study.parse(all_studies.STUDIES["cooperative"], settings)
+    elif getattr(options, "resume", None) is not None:
+        assert {word.split("=")[0] for word in settings} <= {"total_steps"}
+    elif name in ("matd3_jax.sweep", "benchmarks.sweep"):
+        assert sweep.read(settings, getattr(options, "samples", None), 0)[1] or not settings
     else:
-        config.load(rest)
+        config.load(settings, command.keys)
+
+
+def concrete(word, command):
+    """A word with a value that stands for the reader's own made one that can be read; "" where it cannot."""
+    key, value = word.split("=", 1)
+    if key == "runs":
+        return "runs=a,b" if command is arguments_of_commands.PLOT else "runs=a"
+    if not PLACEHOLDER.fullmatch(value):
+        return word
+    field = {field.name: field for field in dataclasses.fields(command.options)}.get(key)
+    hints = typing.get_type_hints(command.options)
+    textual = field is not None and any(kind in (str, Path) for kind in (hints[key], *typing.get_args(hints[key])))
+    return f"{key}={Path(value).name}" if textual else ""
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)

@@ -2,10 +2,10 @@
 
 import pictures
 import pytest
-from matd3_jax.figures.palette import AGENT
 from overestimation_cases import metrics_of
 
 from matd3_jax.figures import q_bias
+from matd3_jax.figures.style import AGENT
 
 
 def lines_of(axis):

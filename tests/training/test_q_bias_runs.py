@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pictures
 import pytest
-from matd3_jax.figures.palette import AGENT
 
 from matd3_jax import config
 from matd3_jax.cli import train
 from matd3_jax.errors import UserError
+from matd3_jax.figures.style import AGENT
 from matd3_jax.runs import overestimation
 from matd3_jax.training import checkpoint
 

@@ -35,8 +35,8 @@ AGENT: tuple[Color, ...] = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY_BLUE, YE
 
 
 def web(color: Color) -> str:
-    """Write a color as "#rrggbb", which matplotlib reads."""
-    return "#{:02x}{:02x}{:02x}".format(*color)
+    """Write a color as "#RRGGBB", which matplotlib reads."""
+    return "#{:02X}{:02X}{:02X}".format(*color)
 
 
 SERIES: tuple[str, ...] = tuple(map(web, (BLUE, ORANGE, GREEN, PURPLE, VERMILION, SKY_BLUE, BLACK)))
