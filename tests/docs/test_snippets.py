@@ -13,7 +13,6 @@ import shlex
 import typing
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 from documents import DOCUMENTS, blocks
@@ -115,12 +114,10 @@ def test_python_parses(name):
         assert block.language in ("python", "sh", "diff", "yaml", "text"), f"{name}:{block.line}: {block.language!r}"
 
 
-@pytest.mark.parametrize("name", ["README.md", "docs/environments.md", "docs/sweeps.md"])
-def test_python_runs(name, tmp_path, monkeypatch, quickly_compiled):
+@pytest.mark.parametrize("name", ["README.md", "docs/environments.md", "docs/running.md", "docs/sweeps.md"])
+def test_python_runs(name, tmp_path, monkeypatch):
     """Blocks of a document share their names. Trainings are shorter than they are written."""
     monkeypatch.chdir(tmp_path)
-    if name != "docs/environments.md":  # whose environments call `jax.jit` within it
-        monkeypatch.setattr(jax, "jit", quickly_compiled)
     names = {"__name__": "snippet"}
     for block in blocks(DOCUMENTS[name]):
         if block.language == "python":
