@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
+import chex
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from matd3_jax import envs
@@ -109,6 +111,8 @@ class TrainingSession:
         kept = config.diagnostics.q_bias_rollouts if config.diagnostics.q_bias else 0
         self.trainer = TrainLoop(self.env, self.layout, schedule, hyper, seeds, local, q_bias_pairs=kept, **options)
         self.evaluator = Evaluator(self.trainer)
+        self.networks_finite = np.ones(self.share.total, bool)
+        """[seeds of all processes, in the first of them] whether each seed's networks were finite in the last row."""
 
     def _hyper(self, team: str) -> HyperParams:
         """The team's hyper-parameters, leaves [seeds]."""
@@ -151,7 +155,7 @@ class TrainingSession:
         state, episodes = self.trainer.warm_up(self.trainer.init(self.keys()))
         row = self.row(state, Metrics(episodes, None))  # type: ignore[arg-type]
         state, columns = self._evaluated(state, due=True)
-        return state, self.processes.gather(row | columns)
+        return state, self._gathered(state, row | columns)
 
     @cached_property
     def interval(self) -> Program:
@@ -166,7 +170,18 @@ class TrainingSession:
             state, metrics = jax.block_until_ready(self.interval(state))
         row = self.row(state, metrics)
         state, columns = self._evaluated(state, self._due(before, self.step(state)))
-        return state, self.processes.gather(row | columns)
+        return state, self._gathered(state, row | columns)
+
+    def _gathered(self, state: TrainState, row: Row) -> Row:
+        """The row with the seeds of all processes in the first of them; notes whose networks are finite."""
+        finite = self.finite(state)
+        row = self.processes.gather({**row, "finite": finite})
+        self.networks_finite = row.pop("finite")
+        return row
+
+    def finite(self, state: TrainState) -> np.ndarray:
+        """Whether the networks of each seed of this process, and their optimizers, have finite numbers only."""
+        return np.asarray(_finite(state.groups))[: len(self.seeds)]
 
     def step(self, state: TrainState) -> int:
         """Env steps of each seed so far."""
@@ -294,3 +309,10 @@ class TrainingSession:
             found = self.evaluator.measure_q_bias(state, self.config.diagnostics.q_bias_steps)
             state = self.evaluator.restart_reservoir(state)
         return state, overestimation.columns(self.layout.agents, found, len(self.seeds))
+
+
+@jax.jit
+def _finite(tree: chex.ArrayTree) -> chex.Array:
+    """[seeds] whether all numbers of the leaves [seeds, ...] are finite."""
+    each = [jnp.isfinite(leaf).reshape(leaf.shape[0], -1).all(axis=1) for leaf in jax.tree.leaves(tree)]
+    return jnp.stack(each).all(axis=0)
