@@ -98,6 +98,15 @@ def without(metrics: Mapping[str, np.ndarray], diverged: Sequence[int] | Mapping
     return {name: column[sound] for name, column in metrics.items()}
 
 
+def cut(metrics: Mapping[str, np.ndarray], diverged: Mapping[int, Divergence]) -> dict[str, np.ndarray]:
+    """The metrics [rows] with nan for all that seeds have after they diverged, but for their counts."""
+    after = np.zeros(len(metrics["step"]), bool)
+    for seed, found in diverged.items():
+        after |= (metrics["seed"] == seed) & (metrics["step"] >= found.step)
+    counts = ("step", "seed", "updates", "episodes")
+    return {name: column if name in counts else np.where(after, np.nan, column) for name, column in metrics.items()}
+
+
 # ---- in words --------------------------------------------------------------------------------------------------------
 
 

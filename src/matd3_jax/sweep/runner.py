@@ -27,7 +27,7 @@ from matd3_jax.sweep import batching
 from matd3_jax.training import checkpoint, finish
 from matd3_jax.training import run as training_run
 from matd3_jax.training.loggers import DivergenceLogger, Logger, TableLogger, TensorBoardLogger
-from matd3_jax.training.memory import fitting_seeds, needed
+from matd3_jax.training.memory import most_seeds, needed
 from matd3_jax.training.progress import ProgressBar
 from matd3_jax.training.session import Row, TrainingSession
 from matd3_jax.training.state import TrainState
@@ -151,7 +151,7 @@ class Batch:
     def train(self, stop: Stop) -> None:
         """From the last checkpoint, or from the start, to the end or until a signal comes."""
         training, settings, begun = self.training, self.members[0], time.monotonic()
-        training.check_memory()
+        training.check_memory(recorded=True)
         if self.processes.first:
             self._announce()
         state, row = self._begin()
@@ -245,3 +245,8 @@ def train(settings: Mapping[str, Config], folder: Path, budget: int | None = Non
         if RunDirectory(path).summary() is None:
             raise UserError(f"{path} is not finished: another process trains it, or the sweep's plan does not have it")
     return runs
+
+
+def fitting_seeds(config: Config, budget: int) -> int:
+    """`most_seeds` of a run's settings."""
+    return most_seeds(TrainingSession(config).trainer, budget)

@@ -111,7 +111,7 @@ class Recorder:
 
     def _checked(self, settings: Config, env: Environment | None) -> TrainingSession:
         training = TrainingSession(settings, env, processes=self.processes)
-        training.check_memory()
+        training.check_memory(recorded=True)
         if settings.tensorboard:
             TensorBoardLogger.check()
         return training

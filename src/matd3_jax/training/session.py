@@ -7,9 +7,7 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
-import chex
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from matd3_jax import envs
@@ -23,11 +21,12 @@ from matd3_jax.errors import UserError
 from matd3_jax.runs import overestimation
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
+from matd3_jax.training import memory
 from matd3_jax.training.clock import Clock
 from matd3_jax.training.evaluator import Evaluator
 from matd3_jax.training.loop import Program, TrainLoop
 from matd3_jax.training.schedule import Schedule
-from matd3_jax.training.state import Metrics, TrainState
+from matd3_jax.training.state import Metrics, TrainState, networks_finite
 
 Row = dict[str, np.ndarray]
 """Columns of the metrics table for one interval: each [seeds]; "step" and "seed" among them."""
@@ -134,14 +133,15 @@ class TrainingSession:
             f"{s.num_agents}, {'more 1, ' if s.n_step > 1 else ''}x' {s.observation_size}, discount 1)"
         )
 
-    def check_memory(self) -> None:
-        """Raise UserError, with the arithmetic, if the replay cannot fit."""
-        free = devices.free_memory(self.processes.local)
-        if self.trainer.replay_bytes > free:
-            raise UserError(
-                f"{self.memory}, but only {free / 1e9:.2f} GB are free: fewer seeds, or replay_capacity at most "
-                f"{int(free * self.trainer.schedule.replay_capacity / self.trainer.replay_bytes):,}"
-            )
+    def check_memory(self, recorded: bool = False) -> None:
+        """Raise UserError, with the arithmetic, unless everything that training takes fits into the memory that is
+        free. recorded: checkpoints are written, too."""
+        parts = memory.parts(self.trainer, len(self.seeds), self.config.eval_episodes if self.eval_every else 0)
+        if not (recorded and self.trainer.on_cpu):
+            del parts["checkpoint"]  # an accelerator's are made in the host's memory
+        parts["replay"] = parts["replay"]._replace(what=self.memory)
+        otherwise = ", or fewer seeds" if len(self.seeds) > 1 else ""
+        memory.check(list(parts.values()), devices.free_memory(self.processes.local), otherwise)
 
     # ---- running -----------------------------------------------------------------------------------------------------
 
@@ -181,7 +181,7 @@ class TrainingSession:
 
     def finite(self, state: TrainState) -> np.ndarray:
         """Whether the networks of each seed of this process, and their optimizers, have finite numbers only."""
-        return np.asarray(_finite(state.groups))[: len(self.seeds)]
+        return np.asarray(networks_finite(state))[: len(self.seeds)]
 
     def step(self, state: TrainState) -> int:
         """Env steps of each seed so far."""
@@ -309,10 +309,3 @@ class TrainingSession:
             found = self.evaluator.measure_q_bias(state, self.config.diagnostics.q_bias_steps)
             state = self.evaluator.restart_reservoir(state)
         return state, overestimation.columns(self.layout.agents, found, len(self.seeds))
-
-
-@jax.jit
-def _finite(tree: chex.ArrayTree) -> chex.Array:
-    """[seeds] whether all numbers of the leaves [seeds, ...] are finite."""
-    each = [jnp.isfinite(leaf).reshape(leaf.shape[0], -1).all(axis=1) for leaf in jax.tree.leaves(tree)]
-    return jnp.stack(each).all(axis=0)
