@@ -13,7 +13,7 @@ from matplotlib.ticker import EngFormatter
 
 from matd3_jax.errors import UserError
 from matd3_jax.figures import style
-from matd3_jax.runs.divergence import Divergence, of_seeds, which
+from matd3_jax.runs.divergence import Divergence, which
 from matd3_jax.runs.metrics import by_seed
 from matd3_jax.stats.intervals import Estimate, t_interval
 
@@ -110,9 +110,13 @@ def learning_curve(
     axes = np.atleast_1d(np.asarray(figure.subplots(len(teams), sharex=True), dtype=object))
     seeds = np.unique(metrics["seed"])
     sound = ~np.isin(seeds, list(diverged))
-    who = f"mean of {of_seeds(len(seeds), diverged)}, 95 % interval" if len(seeds) > 1 else "one seed"
-    if diverged and len(seeds) == 1:
-        who = f"one seed, {which(diverged)}"
+    who = f"mean of {sound.sum()}{f' of {len(seeds)}' if diverged else ''} seeds, 95 % interval"
+    if len(seeds) == 1:
+        who = "one seed" + (", diverged" if diverged else "")
+    elif not sound.any():
+        who = f"all {len(seeds)} seeds diverged"
+    elif diverged:
+        title = f"{title} ({which(diverged)})"
     for axis, team in zip(axes, teams, strict=True):
         color = style.web(style.TEAM.get(team.removeprefix("return_"), style.BLUE))
         evaluated = f"eval_{team}" in metrics
