@@ -52,7 +52,7 @@ def test_a_seed_that_diverges_is_told_of_and_left_out(blown, tmp_path, monkeypat
     recorded = Recorder(say=said.append).start(config.load(SMALL), path)
     (begin,) = {found.step for found in recorded.outcome.diverged.values()}
     assert recorded.outcome.finished and list(recorded.outcome.diverged) == [1]
-    told = [line for line in said if line.startswith(f"seed {LOST} diverged at env step {begin:,}: agent_")]
+    told = [line for line in said if line.startswith(f"seed {LOST} diverged at env step {begin:,}: ")]
     assert len(told) == 2  # when it happens, and at the end
     assert told[1].endswith("; all means are over the other 2 seeds")
     assert f"| 2 of 3 seeds, seed {LOST} diverged at {begin:,}" in capsys.readouterr().out
