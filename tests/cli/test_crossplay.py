@@ -5,6 +5,7 @@ import dataclasses
 import json
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from cross_cases import SEED, SMALL, meet, runs
@@ -12,8 +13,10 @@ from cross_cases import SEED, SMALL, meet, runs
 from matd3_jax import config
 from matd3_jax.cli import crossplay
 from matd3_jax.errors import UserError
+from matd3_jax.evaluation.cross_play import TEAMS
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runs.paths import paths
+from matd3_jax.runtime import devices
 from matd3_jax.training import checkpoint
 from matd3_jax.training.session import TrainingSession
 
@@ -105,6 +108,31 @@ def test_matched_and_sampled(saved, tmp_path, capsys):
         for a in ("mixed", "plain") for b in ("mixed", "plain") for k in range(3)
     ]  # fmt: skip
     assert all(one["return_agents"] != two["return_agents"] for one, two in zip(sampled, still, strict=True))
+
+
+def test_a_seed_that_diverged_does_not_play(saved, tmp_path, capsys, monkeypatch):
+    """The means are those of the other pairs; where none is left, one line says so."""
+    folder = tmp_path / "runs"
+    training, state = runs()["plain"]
+    for name, lost in (("partly", [1]), ("wholly", [0, 1, 2])):
+        groups = jax.tree.map(lambda leaf, lost=lost: np.array(leaf), state.groups)
+        groups[0].actor["bias_0"][lost] = np.nan
+        directory = RunDirectory.create(folder / name, training.config, {})
+        checkpoint.save(directory.checkpoints, 40, training.trainer, state._replace(groups=groups), 1)
+    assert crossplay.main([f"runs={folder / 'partly'},{saved / 'mixed'}", "episodes=2", f"out={tmp_path / 'x'}"]) == 0
+    assert "partly: 2 of 3 seeds, seed 5 diverged at 40, left out" in capsys.readouterr().out
+    pairs = table(tmp_path / "x" / "pairs.csv")
+    assert len(pairs) == (2 + 3) ** 2 and not any(row["return_agents"] == "nan" for row in pairs)
+    of_partly = {row[f"{team}_seed"] for row in pairs for team in TEAMS if row[team] == "partly"}
+    assert of_partly == {"4", "6"}
+    kept = json.loads((tmp_path / "x" / "crossplay.json").read_text())["runs"]
+    assert kept["partly"]["diverged"] == {"5": 40} and kept["mixed"]["diverged"] == {}
+    with pytest.raises(UserError, match="wholly: all seeds diverged"):
+        crossplay.main([f"runs={folder / 'wholly'}", f"out={tmp_path / 'y'}"])
+    monkeypatch.setattr(devices, "free_memory", lambda sharing=1: 10_000_000)
+    with pytest.raises(UserError, match="episodes side by side: episodes at most"):
+        crossplay.main([f"runs={saved / 'mixed'}", "episodes=1000000", f"out={tmp_path / 'y'}"])
+    assert not (tmp_path / "y").exists()
 
 
 def test_one_run(saved, tmp_path):

@@ -281,6 +281,24 @@ def test_seeds_that_end_early_are_told(drawn, tmp_path, capsys):
     assert "the values with seed 1 end; others go on to 1,000" in capsys.readouterr().out
 
 
+def test_seeds_that_diverged_are_told(drawn, tmp_path, capsys):
+    """Even where what they play has a finite return."""
+    make_run(tmp_path / "a", "seeds=2", steps=range(100, 1100, 100), values=np.arange(20.0).reshape(2, 10))
+    metrics = tmp_path / "a" / "metrics.csv"
+    header, *rows = metrics.read_text().splitlines()
+    names = header.split(",")
+    for k, row in enumerate(rows):
+        cells = row.split(",")
+        if cells[1] == "1" and int(cells[0]) >= 400:
+            cells[names.index("agent_0_critic_loss")] = "inf"
+        rows[k] = ",".join(cells)
+    metrics.write_text("\n".join([header, *rows]) + "\n")
+    (axis,) = drawn("runs=a").axes
+    np.testing.assert_array_equal(lines(axis)["matd3"][0], [100, 200, 300])
+    out = capsys.readouterr().out
+    assert "the values with seed 1 end; others go on to 1,000" in out and "seed 1 diverged at 400: values from" in out
+
+
 # ---- tables of several runs ------------------------------------------------------------------------------------------
 
 

@@ -230,7 +230,7 @@ def test_other_settings_and_what_ends_one_end_all():
 
 
 def test_nothing_is_written_where_one_process_cannot_train(tmp_path, monkeypatch):
-    def check(self):
+    def check(self, recorded=False):
         if self.processes.index == 1:
             raise UserError("no memory here")
 

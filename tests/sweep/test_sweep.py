@@ -114,7 +114,7 @@ def test_the_table_ranks_by_the_mean_of_the_last_tenth(swept, tmp_path, monkeypa
         assert row["setting"] == f"lr_{row['algo.lr']}-tau_{row['algo.tau']}"
     with (swept / "seeds.csv").open(newline="") as file:
         assert len(list(csv.DictReader(file))) == 8
-    assert {BEST[k] for k in range(4)} <= pictures.colors(swept / "sweep.png")
+    assert {BEST[k].upper() for k in range(4)} <= pictures.colors(swept / "sweep.png")
     figures, facts = pictures.written(monkeypatch), json.loads((swept / "sweep.json").read_text())
     ranked = ranking.rank(swept / "runs", facts["runs"], facts["settings"], "return_agents")
     figure.draw(tmp_path / "again.png", swept / "runs", facts["runs"], ranked, "return_agents")
@@ -160,7 +160,7 @@ def test_a_sweep_that_diverged_everywhere_is_reported(swept, tmp_path):
         kept = len(("step", "seed", "updates", "episodes"))
         lost = [",".join([*row.split(",")[:kept], *["nan"] * (len(row.split(",")) - kept)]) for row in rows]
         metrics.write_text("\n".join([header, *lost]) + "\n")
-    assert sweep.main([f"resume={copy}"]) == 0
+    assert sweep.main([f"resume={copy}"]) == 3
     with (copy / "table.csv").open(newline="") as file:
         assert [row["diverged"] for row in csv.DictReader(file)] == ["2"] * 4
 

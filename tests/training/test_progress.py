@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import matd3_jax
+from matd3_jax.runs.divergence import Divergence
 from matd3_jax.training import clock, progress
 from matd3_jax.training.clock import Clock
 from matd3_jax.training.loop import Program
@@ -80,7 +81,24 @@ def test_before_an_episode_has_ended(begin, capsys):
     bar.spend(training=10)
     text = shown(bar, capsys, row(500, return_agents=np.array([np.nan, 8]), eval_return_agents=np.array([1.0, 1]),
                                   eval_forward_velocity=np.array([-2.0, 0])))  # fmt: skip
-    assert text.endswith("| agents 8.0 (evaluation 1.0 ± 0.0, -1.00 m/s)")
+    assert text.endswith("| agents 8.0, 1 of 2 seeds (evaluation 1.0 ± 0.0, -1.00 m/s)")
+
+
+def test_seeds_that_diverged_are_left_out_and_named(begin, capsys):
+    """Of what was known of them before they diverged, too."""
+    bar = begin(row(0))
+    bar.spend(training=10)
+    both = {"seed": np.array([5, 6]), "return_agents": np.array([1.0, 3]), "eval_return_agents": np.array([5.0, 9])}
+    assert shown(bar, capsys, row(100, **both)).endswith("| agents 2.0 ± 1.4 (evaluation 7.0 ± 2.8)")
+    bar.diverged = {1: Divergence(200, "agent_0_critic_loss is nan")}
+    bar.spend(training=10)
+    missing = {"seed": np.array([5, 6]), "return_agents": NAN, "eval_return_agents": NAN}
+    text = shown(bar, capsys, row(200, **missing))
+    assert text.endswith("| agents 1.0 at 100 (evaluation 5.0) | 1 of 2 seeds, seed 6 diverged at 200")
+    bar.diverged = {0: Divergence(300, "x is inf"), **bar.diverged}
+    bar.spend(training=10)
+    text = shown(bar, capsys, row(300, **both))
+    assert text.endswith("left | none of 2 seeds, seed 5 diverged at 300, seed 6 diverged at 200")
 
 
 def test_without_evaluations_and_without_measures(begin, capsys):

@@ -157,6 +157,26 @@ def test_a_damaged_metrics_table_leads_on_and_is_named(copy, whole, name):
     assert RunDirectory(copy).summary() is not None
 
 
+def test_any_missing_file_of_a_checkpoint_is_named(copy):
+    """Each file alone, and each folder of an array."""
+    *_, before, last = checkpoint.steps(copy / "checkpoints")
+    folder = copy / "checkpoints" / str(last)
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    parts = {path.relative_to(folder).parts[0] for path in files}
+    assert parts == {"state", "replay", "checksums.json"} and len(files) > 10
+    assert {path.name for path in files} >= {"_METADATA", "manifest.ocdbt", "checksums.json"}
+    aside = copy / "aside"
+    for path in [*files, folder / "state", folder / "replay" / "0"]:
+        path.rename(aside)
+        with pytest.raises(UserError) as error:
+            resume(copy, total_steps=2000)
+        aside.rename(path)
+        named = path.relative_to(folder)
+        assert f"{folder} is damaged ({named}" in str(error.value) and "is missing)" in str(error.value), named
+        assert f"checkpoint={before}" in str(error.value)
+    assert checkpoint.verify(copy / "checkpoints", last).name == str(last)
+
+
 def test_a_second_process_is_refused(copy):
     back_to(copy, checkpoint.steps(copy / "checkpoints")[1])
     before = {p: p.read_bytes() for p in copy.rglob("*") if p.is_file()}

@@ -10,6 +10,9 @@ from matd3_jax.cli import arguments, options
 from matd3_jax.cli.options import Command
 from matd3_jax.errors import OptionError, UserError
 
+DIVERGED = 3
+"""Exit code where all seeds diverged, or one did that ended the run (docs/running.md)."""
+
 
 def start(name: str, argv: Sequence[str]) -> int:
     """Run one of our commands by its name: its exit code. Help needs none of what the command itself imports."""

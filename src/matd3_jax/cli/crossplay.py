@@ -23,10 +23,12 @@ from matd3_jax.evaluation import cross_play
 from matd3_jax.evaluation.cross_play import TEAMS, Team
 from matd3_jax.evaluation.cross_play_table import Mean, Pairings, pairs_of
 from matd3_jax.figures import heat_map
+from matd3_jax.runs import divergence
 from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.runs.divergence import Divergence
 from matd3_jax.runs.paths import check_new_directory
 from matd3_jax.runtime import devices
-from matd3_jax.training import checkpoint
+from matd3_jax.training import checkpoint, memory
 from matd3_jax.training.session import TrainingSession
 
 
@@ -39,6 +41,13 @@ class Entrant(NamedTuple):
     step: int
     """Env step of the checkpoint."""
     teams: dict[str, Team]
+    diverged: dict[int, Divergence]
+    """Seeds that do not play, by their numbers."""
+
+    @property
+    def sound(self) -> list[int]:
+        """Places of the seeds that play."""
+        return [k for k in range(self.settings.seeds) if self.settings.seed + k not in self.diverged]
 
 
 def main(argv: Sequence[str]) -> int:
@@ -48,7 +57,7 @@ def main(argv: Sequence[str]) -> int:
         check_new_directory(options.out, "out")
     devices.prepare()
     matched = options.pairing == "matched"
-    entrants, env = _entrants(options.runs, options.checkpoint, matched)
+    entrants, env = _entrants(options.runs, options.checkpoint, matched, options.episodes)
     name = f"{entrants[0].settings.env['name']}-{time.strftime('%Y%m%d-%H%M%S')}"
     out = options.out or Path("crossplay") / name
     check_new_directory(out, "out")
@@ -57,6 +66,9 @@ def main(argv: Sequence[str]) -> int:
     kind = "deterministic" if options.deterministic else "sampled"
     who = "seed with seed" if matched else "seeds x seeds"
     title = f"{entrants[0].settings.env['name']}, {who}, {options.episodes} {kind} episodes of each pair"
+    for entrant in entrants:
+        if entrant.diverged:
+            print(f"{entrant.name}: {divergence.of_seeds(entrant.settings.seeds, entrant.diverged)}, left out")
     _print(pairings, [entrant.name for entrant in entrants], title)
     _write(out, pairings, entrants, options)
     heat_map.draw(out / "heat_map.png", [entrant.name for entrant in entrants], pairings, title)
@@ -69,7 +81,9 @@ def main(argv: Sequence[str]) -> int:
 # ---- who plays -------------------------------------------------------------------------------------------------------
 
 
-def _entrants(where: Sequence[Path], step: int | None, matched: bool) -> tuple[list[Entrant], Environment]:
+def _entrants(
+    where: Sequence[Path], step: int | None, matched: bool, episodes: int
+) -> tuple[list[Entrant], Environment]:
     """The runs, and the environment that all have in common."""
     opened = [RunDirectory.open(path) for path in where]
     for k, path in enumerate(where):
@@ -92,9 +106,18 @@ def _entrants(where: Sequence[Path], step: int | None, matched: bool) -> tuple[l
     entrants = []
     for name, (run, settings), saved in zip(names, opened, found, strict=True):
         training = TrainingSession(settings)
+        together = cross_play.side_by_side(settings.seeds**2, episodes)
+        memory.check_playing(env, training.layout, episodes, together, devices.free_memory())
         state = checkpoint.restore_actors(saved, training.trainer)
         teams = {team: cross_play.team_of(training, env, state, team) for team in TEAMS}
-        entrants.append(Entrant(name, run.path, settings, int(saved.name), teams))
+        step, numbers = int(saved.name), range(settings.seed, settings.seed + settings.seeds)
+        diverged = divergence.of_networks(training.finite(state), numbers, step)
+        diverged = divergence.earliest(divergence.of_run(run, step), diverged)
+        entrants.append(Entrant(name, run.path, settings, step, teams, diverged))
+        if not entrants[-1].sound:
+            raise UserError(f"{run.path}: all seeds diverged ({divergence.which(diverged)}): nobody can play")
+    if matched and not set.intersection(*(set(entrant.sound) for entrant in entrants)):
+        raise UserError("pairing=matched: each of the pairs has a seed that diverged")
     return entrants, env
 
 
@@ -122,6 +145,7 @@ def _play(entrants: Sequence[Entrant], env: Environment, options: CrossPlay, mat
     console = Console(stderr=True)
     for i, j in track(cells, "playing", console=console, transient=True, disable=not console.is_terminal):
         pairs = pairs_of(entrants[i].settings.seeds, entrants[j].settings.seeds, matched)
+        pairs = pairs[np.isin(pairs[:, 0], entrants[i].sound) & np.isin(pairs[:, 1], entrants[j].sound)]
         teams = [entrants[i].teams["agents"], entrants[j].teams["adversaries"]]
         played = cross_play.play(env, teams, pairs, options.episodes, options.deterministic, options.seed)
         runs.append(np.broadcast_to((i, j), pairs.shape))
@@ -188,6 +212,7 @@ def _write(out: Path, pairings: Pairings, entrants: Sequence[Entrant], options: 
             "checkpoint": e.step,
             "algorithms": {team: algo.name for team, algo in e.settings.teams().items()},
             "seeds": [e.settings.seed + k for k in range(e.settings.seeds)],
+            "diverged": {str(seed): found.step for seed, found in e.diverged.items()},
         }
         for e in entrants
     }

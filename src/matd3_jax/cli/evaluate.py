@@ -9,11 +9,12 @@ from rich.table import Table
 
 from matd3_jax.cli import arguments
 from matd3_jax.core.rollout import Evaluation
+from matd3_jax.runs import divergence
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import devices
 from matd3_jax.stats.intervals import mean_interval
 from matd3_jax.stats.text import plus_minus
-from matd3_jax.training import checkpoint
+from matd3_jax.training import checkpoint, memory
 from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import TrainState
 
@@ -24,10 +25,18 @@ def main(argv: Sequence[str]) -> int:
     devices.prepare()
     run, settings = RunDirectory.open(options.run)
     training = TrainingSession(settings)
+    seeds_played = training.trainer.sharding.padded_seeds * training.trainer.sharding.devices_per_seed
+    memory.check_playing(training.env, training.layout, options.episodes, seeds_played, devices.free_memory())
     path = checkpoint.verify(run.checkpoints, options.checkpoint)
     state = checkpoint.restore_actors(path, training.trainer)
-    table = Table(title=f"{run.path}, env step {int(path.name):,}: means of {options.episodes} episodes a seed")
-    for heading in ("policy", "quantity", *(f"seed {settings.seed + i}" for i in range(settings.seeds)), "mean ± 95 %"):
+    step, numbers = int(path.name), np.arange(settings.seed, settings.seed + settings.seeds)
+    diverged = divergence.of_networks(training.finite(state), numbers, step)
+    diverged = divergence.earliest(divergence.of_run(run, step), diverged)
+    sound = ~np.isin(numbers, list(diverged))
+    whose = f", of {divergence.of_seeds(settings.seeds, diverged)}" if diverged else ""
+    table = Table(title=f"{run.path}, env step {step:,}: means of {options.episodes} episodes a seed{whose}")
+    seeds = (f"seed {seed}" + (" (diverged)" if seed in diverged else "") for seed in numbers)
+    for heading in ("policy", "quantity", *seeds, "mean ± 95 %"):
         table.add_column(heading, justify="left" if heading in ("policy", "quantity") else "right")
     rows = []
     policies = {"deterministic": state, "sampled": state}
@@ -37,18 +46,18 @@ def main(argv: Sequence[str]) -> int:
         found = training.evaluate(played, options.episodes, policy != "sampled", options.seed)
         for quantity, by_episode in _quantities(training, found):
             by_seed = by_episode.mean(axis=1)
-            interval = plus_minus(*mean_interval(by_seed), ".2f", ".2f")
+            interval = plus_minus(*mean_interval(by_seed[sound]), ".2f", ".2f") if sound.any() else "-"
             table.add_row(policy, quantity, *(f"{value:.2f}" for value in by_seed), interval)
             spread = by_episode.std(axis=1, ddof=1) if options.episodes > 1 else np.full(settings.seeds, np.nan)
             rows += [
-                (policy, quantity, settings.seed + i, by_seed[i], spread[i], options.episodes)
-                for i in range(settings.seeds)
+                (policy, quantity, seed, by_seed[i], spread[i], options.episodes, int(not sound[i]))
+                for i, seed in enumerate(numbers)
             ]
         table.add_section()
     Console(width=None if Console().is_terminal else 200).print(table)
     with (run.path / "evaluation.csv").open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(("policy", "quantity", "seed", "mean", "std", "episodes"))
+        writer.writerow(("policy", "quantity", "seed", "mean", "std", "episodes", "diverged"))
         writer.writerows(rows)
     return 0
 

@@ -13,7 +13,7 @@ from matd3_jax.config import Config, diff
 from matd3_jax.errors import UserError, nearest
 from matd3_jax.figures import learning_curves
 from matd3_jax.figures.learning_curves import Line, Panel
-from matd3_jax.runs import curves, directory
+from matd3_jax.runs import curves, directory, divergence
 from matd3_jax.stats import bootstrap, intervals
 
 INTERVALS = {"mean": ("t", "bootstrap", "sd", "none"), "median": ("bootstrap", "none"), "iqm": ("bootstrap", "none")}
@@ -33,7 +33,11 @@ def main(argv: Sequence[str]) -> int:
         raise UserError(f"labels={','.join(labels)}: names {len(labels)}, but there are {len(groups)}: "
                         f"{'; '.join(found_labels)}")  # fmt: skip
     tables = [directory.together(paths) for paths in groups]
-    found = {name: [_curves(*part, name, options) for part in zip(tables, groups, strict=True)] for name in options.y}
+    lost = [divergence.of_table(table) for table in tables]
+    tables = [divergence.cut(*part) for part in zip(tables, lost, strict=True)]
+    found = {
+        name: [_curves(*part, name, options) for part in zip(tables, groups, lost, strict=True)] for name in options.y
+    }
     many = len({len(table.seeds) for table in found[options.y[0]]}) > 1
     panels = [
         Panel(_y_label(name, tables[0]), [_line(*part, many, options) for part in zip(labels, columns, strict=True)])
@@ -44,8 +48,8 @@ def main(argv: Sequence[str]) -> int:
     caption = _caption(tables[0], many, options)
     learning_curves.compare(options.out, panels, X_LABELS[options.x] + over, title, caption, options.each)
     for panel, (name, columns) in zip(panels, found.items(), strict=True):
-        for label, line, column in zip(labels, panel.lines, columns, strict=True):
-            _tell(f"{label}: {name}", line.estimate, column, options)
+        for label, line, column, diverged in zip(labels, panel.lines, columns, lost, strict=True):
+            _tell(f"{label}: {name}", line.estimate, column, diverged, options)
     print(options.out)
     return 0
 
@@ -64,14 +68,21 @@ def _groups(paths: Sequence[Path]) -> dict[tuple[Path, ...], Config]:
     return {tuple(members): settings for _, members, settings in found}
 
 
-def _curves(table: Mapping[str, np.ndarray], paths: Sequence[Path], name: str, options: Plot) -> curves.Curves:
+def _curves(
+    table: Mapping[str, np.ndarray],
+    paths: Sequence[Path],
+    diverged: Mapping[int, divergence.Divergence],
+    name: str,
+    options: Plot,
+) -> curves.Curves:
     where = ", ".join(map(str, paths))
     if name not in table or name == "seed":
         raise UserError(f"y={name}: {where} has no such column; {nearest(name, (c for c in table if c != 'seed'))}")
     try:
         return curves.of_table(table, name, options.x, options.window)
     except ValueError as error:
-        raise UserError(f"y={name} of {where}: {error}") from error
+        lost = f" ({divergence.which(diverged)})" if diverged else ""
+        raise UserError(f"y={name} of {where}: {error}{lost}") from error
 
 
 def _line(label: str, found: curves.Curves, many: bool, options: Plot) -> Line:
@@ -91,7 +102,13 @@ def _estimate(values: np.ndarray, options: Plot) -> intervals.Estimate:
     return intervals.Estimate(middle, middle - half, middle + half)
 
 
-def _tell(what: str, estimate: intervals.Estimate, found: curves.Curves, options: Plot) -> None:
+def _tell(
+    what: str,
+    estimate: intervals.Estimate,
+    found: curves.Curves,
+    diverged: Mapping[int, divergence.Divergence],
+    options: Plot,
+) -> None:
     """Print where a line ends, what it is there, and which seeds do not go as far as the others."""
     value, low, high = (float(part[-1]) for part in estimate)
     count = len(found.seeds)
@@ -102,6 +119,8 @@ def _tell(what: str, estimate: intervals.Estimate, found: curves.Curves, options
     if farthest - found.x[-1] > 2 * np.diff(found.x, prepend=0).max():
         early = ", ".join(f"{seed:.0f}" for seed in found.seeds[found.ends == shortest])
         print(f"  drawn up to there because the values with seed {early} end; others go on to {farthest:,.0f}")
+    if diverged:
+        print(f"  {divergence.which(diverged)}: values from there on are left out")
 
 
 def _y_label(name: str, table: Mapping[str, np.ndarray]) -> str:

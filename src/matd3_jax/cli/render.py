@@ -3,13 +3,15 @@
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from matd3_jax.cli import arguments
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError
 from matd3_jax.evaluation import trajectory
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import devices
-from matd3_jax.training import checkpoint
+from matd3_jax.training import checkpoint, memory
 from matd3_jax.training.session import TrainingSession
 from matd3_jax.video import encode, frames
 
@@ -29,8 +31,20 @@ def main(argv: Sequence[str]) -> int:
     out = options.out or run.path / "episode.gif"
     encode.check(out, options.fps or 1)
     training = _training(settings)
+    longest = training.env.episode_length
+    steps = longest if options.max_steps is None else min(options.max_steps, longest)
+    kept = memory.Part(steps * memory.playing_bytes(training.env, training.layout), "its env steps", "max_steps", steps)
+    memory.check([kept], devices.free_memory())
     drawing = frames.drawing_of(training.env)
-    state = checkpoint.restore_actors(checkpoint.verify(run.checkpoints, options.checkpoint), training.trainer)
+    saved = checkpoint.verify(run.checkpoints, options.checkpoint)
+    state = checkpoint.restore_actors(saved, training.trainer)
+    finite = training.finite(state)
+    if not finite[seed - settings.seed]:
+        others = ", ".join(str(settings.seed + i) for i in np.flatnonzero(finite))
+        raise UserError(
+            f"seed={seed} of {run.path} diverged: its networks are not finite at env step {int(saved.name):,}"
+            + (f"; they are with seed={others}" if others else ", and so with all others; try an earlier checkpoint=")
+        )
     played = trajectory.play(
         training,
         state,

@@ -146,8 +146,7 @@ def _train(sweep: Sweep, batch: int | None, facts: Mapping[str, Any]) -> int:
 def _report_if_finished(sweep: Sweep, batch: int | None, facts: Mapping[str, Any]) -> int:
     left = [k for k in range(len(sweep.batches)) if not sweep.finished(k)]
     if not left:
-        report(sweep, facts)
-        return 0
+        return command.DIVERGED if report(sweep, facts) else 0
     print(f"not finished yet: batch {', '.join(map(str, left))}; resume with: {_resume_line(sweep.folder)}")
     return 0 if batch is not None and batch not in left else 1
 
@@ -156,11 +155,12 @@ def _resume_line(folder: Path) -> str:
     return command.line("matd3_jax.sweep", resume=folder)
 
 
-def report(sweep: Sweep, facts: Mapping[str, Any]) -> None:
-    """Table, CSVs and figure of a finished sweep."""
+def report(sweep: Sweep, facts: Mapping[str, Any]) -> bool:
+    """Table, CSVs and figure of a finished sweep; whether all its seeds diverged."""
     rows = ranking.rank(sweep.runs, facts["runs"], facts["settings"], str(facts["metric"]))
     ranking.show(rows, f"{sweep.folder}: {facts['metric']}")
     ranking.write(sweep.folder, rows)
     sweep_figure.draw(sweep.folder / "sweep.png", sweep.runs, facts["runs"], rows, str(facts["metric"]))
     print(f"all settings: {sweep.folder / 'table.csv'}, all seeds: {sweep.folder / 'seeds.csv'}\n"
           f"figure: {sweep.folder / 'sweep.png'}\nruns: {sweep.runs}")  # fmt: skip
+    return all(row.diverged.all() for row in rows)

@@ -30,14 +30,18 @@ def main(argv: Sequence[str]) -> int:
         else:
             settings = config.load(given.settings, arguments.TRAIN.keys)
             recorded = recorder.start(settings, Path(settings.out) / (settings.name or _name(settings)))
-        path, stopped = recorded.directory.path, recorded.outcome.stopped
-        if stopped is None:
+        path, outcome = recorded.directory.path, recorded.outcome
+        everywhere = processes.broadcast(len(outcome.diverged) == recorded.training.share.total)
+        if outcome.finished:
             recorder.say(f"evaluate with: {command.line('matd3_jax.evaluate', run=path)}")
-            return 0
-        step = recorded.training.step(recorded.outcome.state)
+            return command.DIVERGED if everywhere else 0
+        step = recorded.training.step(outcome.state)
         line = command.line("matd3_jax.train", resume=path)
-        recorder.say(f"stopped by {stopped.name} at env step {step:,}; resume with: {line}")
-        return 128 + stopped
+        if outcome.stopped is None:
+            recorder.say(f"stopped at env step {step:,} since a seed diverged; go on with: {line}")
+            return command.DIVERGED
+        recorder.say(f"stopped by {outcome.stopped.name} at env step {step:,}; resume with: {line}")
+        return 128 + outcome.stopped
 
 
 def _total_steps(overrides: Sequence[str]) -> int | None:

@@ -148,6 +148,7 @@ class Config:
     checkpoint_minutes: float = setting(BOOKKEEPING, least=0, before=10.0)
     keep_checkpoints: int = setting(BOOKKEEPING, least=1)
     tensorboard: bool = setting(BOOKKEEPING)
+    on_divergence: str = setting(BOOKKEEPING, choices=("continue", "stop"), before="continue")
 
     def teams(self) -> dict[str, AlgoConfig]:
         """The algorithm of each team."""

@@ -125,9 +125,7 @@ def play(
     """
     key = jax.random.fold_in(jax.random.key(seed), 2**31 - 1)
     devices = jax.devices()[: len(pairs)]
-    share = -(-len(pairs) // len(devices))
-    width = SIDE_BY_SIDE["cpu" if devices[0].platform == "cpu" else "other"]
-    batch = min(share, max(1, width // episodes)) * len(devices)
+    batch = side_by_side(len(pairs), episodes)
     program = _program(env, tuple(team.side for team in teams), tuple(devices), episodes, deterministic)
     policies = jax.device_put(tuple(team.policy for team in teams))
     found = []
@@ -137,6 +135,13 @@ def play(
         returns = np.asarray(program(policies, jnp.asarray(chosen), key), np.float64)
         found.append(returns.mean(axis=1)[: len(pairs) - start])
     return np.concatenate(found)
+
+
+def side_by_side(pairs: int, episodes: int) -> int:
+    """How many of the pairs are played at a time, a multiple of the devices that play."""
+    devices = jax.devices()[:pairs]
+    width = SIDE_BY_SIDE["cpu" if devices[0].platform == "cpu" else "other"]
+    return min(-(-pairs // len(devices)), max(1, width // episodes)) * len(devices)
 
 
 @functools.cache

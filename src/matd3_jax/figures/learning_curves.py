@@ -13,6 +13,7 @@ from matplotlib.ticker import EngFormatter
 
 from matd3_jax.errors import UserError
 from matd3_jax.figures import style
+from matd3_jax.runs.divergence import Divergence, which
 from matd3_jax.runs.metrics import by_seed
 from matd3_jax.stats.intervals import Estimate, t_interval
 
@@ -94,9 +95,11 @@ def compare(
             raise UserError(f"cannot write {path}: {error.strerror}") from error
 
 
-def learning_curve(path: Path, metrics: Mapping[str, np.ndarray], title: str) -> None:
+def learning_curve(
+    path: Path, metrics: Mapping[str, np.ndarray], title: str, diverged: Mapping[int, Divergence]
+) -> None:
     """Draw the return of every team over env steps, in training and (where there are any) in evaluations: each seed,
-    their mean, and its 95 % interval.
+    the mean of those that did not diverge, and its 95 % interval.
 
     Args:
         metrics: columns [rows] of the metrics table.
@@ -106,7 +109,14 @@ def learning_curve(path: Path, metrics: Mapping[str, np.ndarray], title: str) ->
     FigureCanvasAgg(figure)
     axes = np.atleast_1d(np.asarray(figure.subplots(len(teams), sharex=True), dtype=object))
     seeds = np.unique(metrics["seed"])
-    who = f"mean of {len(seeds)} seeds, 95 % interval" if len(seeds) > 1 else "one seed"
+    sound = ~np.isin(seeds, list(diverged))
+    who = f"mean of {sound.sum()}{f' of {len(seeds)}' if diverged else ''} seeds, 95 % interval"
+    if len(seeds) == 1:
+        who = "one seed" + (", diverged" if diverged else "")
+    elif not sound.any():
+        who = f"all {len(seeds)} seeds diverged"
+    elif diverged:
+        title = f"{title} ({which(diverged)})"
     for axis, team in zip(axes, teams, strict=True):
         color = style.web(style.TEAM.get(team.removeprefix("return_"), style.BLUE))
         evaluated = f"eval_{team}" in metrics
@@ -114,7 +124,10 @@ def learning_curve(path: Path, metrics: Mapping[str, np.ndarray], title: str) ->
         kinds += [(f"eval_{team}", "evaluation (deterministic)", color)] if evaluated else []
         for name, kind, shade in kinds:
             steps, curves = by_seed(metrics, name)
-            style.band(axis, steps, t_interval(curves), shade, f"{kind}, {who}", seeds=curves)
+            nothing = np.full(len(steps), np.nan)
+            shown = curves[sound] if len(seeds) > 1 else curves
+            estimate = t_interval(shown) if len(shown) else Estimate(nothing, nothing, nothing)
+            style.band(axis, steps, estimate, shade, f"{kind}, {who}", seeds=curves)
         style.dress(axis)
         axis.set_ylabel(f"return\n{team.removeprefix('return_')}")
         axis.legend(loc="lower right", frameon=False)

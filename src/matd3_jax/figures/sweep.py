@@ -8,6 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from matd3_jax.figures import style
+from matd3_jax.runs import divergence
 from matd3_jax.runs.directory import together
 from matd3_jax.runs.metrics import by_seed
 from matd3_jax.stats.intervals import t_interval
@@ -42,7 +43,11 @@ def draw(path: Path, folder: Path, runs: Mapping[str, Sequence[str]], rows: Sequ
 def _curves(axis, folder: Path, runs: Mapping[str, Sequence[str]], rows: Sequence[Ranked], metric: str) -> None:
     means = []
     for k, row in reversed(list(enumerate(rows))):
-        steps, curves = by_seed(together([folder / run for run in runs[row.name]]), metric)
+        table = together([folder / run for run in runs[row.name]])
+        sound = divergence.without(table, row.seeds[row.diverged].tolist())
+        if not sound["step"].size:
+            continue  # nothing is known of a setting that always diverged
+        steps, curves = by_seed(sound, metric)
         means.append(curves.mean(axis=0))
         if k >= len(BEST):
             label = "others" if k == len(BEST) else None
@@ -55,7 +60,7 @@ def _curves(axis, folder: Path, runs: Mapping[str, Sequence[str]], rows: Sequenc
     axis.set_ylabel(metric)
     axis.set_title("mean over seeds, 95 % interval", fontsize=10)
     # A range that holds all means: intervals of few seeds reach far beyond what there is to see.
-    finite = np.concatenate(means)
+    finite = np.concatenate(means or [np.empty(0)])
     finite = finite[np.isfinite(finite)]
     if finite.size:  # not where everything diverged
         room = 0.1 * (np.ptp(finite) or 1.0)

@@ -1,35 +1,45 @@
 """The summary of a run: the last tenth of it, over its seeds."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from matd3_jax.runs import divergence
+from matd3_jax.runs.divergence import Divergence
 from matd3_jax.stats.intervals import mean_interval
 from matd3_jax.stats.text import plus_minus
 
 
 def finals(metrics: dict[str, np.ndarray]) -> dict[str, tuple[float, float | None]]:
-    """For each team `final` of the mean training return in the last tenth of the run, if all seeds ended episodes."""
-    late = metrics["step"] > 0.9 * metrics["step"].max()
+    """For each team `final` of the mean training return in the last tenth of the run, if all seeds ended episodes.
+
+    Args:
+        metrics: columns [rows] of the metrics table, without seeds that diverged.
+    """
+    late = metrics["step"] > 0.9 * metrics["step"].max(initial=0)
     finals = {}
     for name in (name for name in metrics if name.startswith("return_")):
         there = late & ~np.isnan(metrics[name])  # long episodes need not end within an interval
         seeds = [metrics[name][there & (metrics["seed"] == s)] for s in np.unique(metrics["seed"])]
-        if all(values.size for values in seeds):
+        if seeds and all(values.size for values in seeds):
             finals[name.removeprefix("return_")] = final(np.array([values.mean() for values in seeds]))
     return finals
 
 
-def summary(metrics: dict[str, np.ndarray], row: dict[str, np.ndarray], **facts: Any) -> dict[str, Any]:
-    """What a run leaves in summary.json at its end.
+def summary(metrics: dict[str, np.ndarray], diverged: Mapping[int, Divergence], **facts: Any) -> dict[str, Any]:
+    """What a run leaves in summary.json at its end: means over the seeds that did not diverge; no means without any.
 
     Args:
-        metrics: columns [rows] of its metrics table; row: the last row of it, columns [seeds].
+        metrics: columns [rows] of its metrics table.
     """
-    found = {"total_steps": int(row["step"][0]), **facts, "last_tenth": finals(metrics)}
-    evaluated = [name for name in row if name.startswith("eval_") or name.endswith("_eval_return")]
-    if evaluated:
-        found["last_evaluation"] = {name.replace("eval_", "", 1): final(row[name]) for name in evaluated}
+    steps = {str(seed): found.step for seed, found in diverged.items()}
+    sound = divergence.without(metrics, diverged)
+    found = {"total_steps": int(metrics["step"].max()), **facts, "diverged": steps, "last_tenth": finals(sound)}
+    evaluated = [name for name in metrics if name.startswith("eval_") or name.endswith("_eval_return")]
+    if evaluated and sound["step"].size:
+        last = sound["step"] == sound["step"].max()
+        found["last_evaluation"] = {name.replace("eval_", "", 1): final(sound[name][last]) for name in evaluated}
     return found
 
 

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from matd3_jax.errors import UserError, nearest
+from matd3_jax.runs import divergence
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.stats.intervals import mean_interval
 from matd3_jax.stats.text import plus_minus
@@ -28,7 +29,7 @@ class Ranked:
     area: np.ndarray
     """Mean of the metric over the whole run after the first row: the area under the curve for each env step."""
     diverged: np.ndarray
-    """Whether the seed's critics ended with numbers that are not finite."""
+    """Whether the seed's losses, values or returns were not finite at some time (`runs.divergence`)."""
 
     def interval(self, which: str) -> tuple[float, float]:
         """Mean and half width of its 95 % interval (t) of "final" or "area" over the seeds that did not diverge."""
@@ -55,6 +56,8 @@ def rank(folder: Path, runs: Mapping[str, Sequence[str]], settings: Mapping[str,
             table = RunDirectory(folder / run).read_metrics()
             if metric not in table:
                 raise UserError(f"metric={metric}: the metrics table has no such column; {nearest(metric, table)}")
+            summary = RunDirectory(folder / run).summary() or {}
+            lost = {*divergence.of_table(table), *map(int, summary.get("diverged", ()))}
             for seed in np.unique(table["seed"]):
                 there = table["seed"] == seed
                 steps, curve = table["step"][there], table[metric][there]
@@ -62,8 +65,7 @@ def rank(folder: Path, runs: Mapping[str, Sequence[str]], settings: Mapping[str,
                 seeds.append(int(seed))
                 final.append(_mean(curve[late]))
                 area.append(_mean(curve[1:]))
-                ends = [v[there][-1] for n, v in table.items() if n.endswith(("_critic_loss", "_q_value"))]
-                diverged.append(not np.isfinite(ends).all())
+                diverged.append(int(seed) in lost)
         rows.append(Ranked(name, values, np.array(seeds), np.array(final), np.array(area), np.array(diverged)))
 
     def order(row: Ranked) -> tuple[float, float]:
@@ -85,6 +87,10 @@ def show(rows: Sequence[Ranked], title: str, most: int = 30) -> None:
     Console(width=None if Console().is_terminal else 200).print(table)
     if len(rows) > most:
         print(f"and {len(rows) - most} more settings")
+    lost = [f"{row.name} seed {seed}" for row in rows for seed in row.seeds[row.diverged]]
+    if lost:
+        more = f", and {len(lost) - 10} more" if len(lost) > 10 else ""
+        print(f"diverged, left out of all means: {', '.join(lost[:10])}{more}")
 
 
 def write(folder: Path, rows: Sequence[Ranked]) -> None:

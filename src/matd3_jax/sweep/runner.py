@@ -17,15 +17,17 @@ import numpy as np
 
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError
+from matd3_jax.runs import divergence
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import devices, files
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
+from matd3_jax.runtime.terminal import say
 from matd3_jax.sweep import batching
 from matd3_jax.training import checkpoint, finish
 from matd3_jax.training import run as training_run
-from matd3_jax.training.loggers import Logger, TableLogger, TensorBoardLogger
-from matd3_jax.training.memory import fitting_seeds, needed
+from matd3_jax.training.loggers import DivergenceLogger, Logger, TableLogger, TensorBoardLogger
+from matd3_jax.training.memory import most_seeds, needed
 from matd3_jax.training.progress import ProgressBar
 from matd3_jax.training.session import Row, TrainingSession
 from matd3_jax.training.state import TrainState
@@ -62,6 +64,8 @@ class Sweep:
         """
         if any(config.tensorboard for config in settings.values()):
             TensorBoardLogger.check()
+        if any(config.on_divergence != "continue" for config in settings.values()):
+            raise UserError("on_divergence=stop: a sweep's runs are trained side by side, and none ends the others")
         budget = devices.free_memory(self.processes.local) if budget is None else budget
         size = self.processes.size
         existing = batching.existing_runs(self.runs)
@@ -138,18 +142,23 @@ class Batch:
         self.seeds = [slice(end - config.seeds, end) for end, config in zip(ends.tolist(), self.members, strict=True)]
         """Where each run's seeds are."""
         self.table = TableLogger(self.runs, self.seeds)
+        self.watch = DivergenceLogger(
+            self.training,
+            say,
+            names=[f"{c.name}: seed {seed}" for c in self.members for seed in range(c.seed, c.seed + c.seeds)],
+        )
 
     def train(self, stop: Stop) -> None:
         """From the last checkpoint, or from the start, to the end or until a signal comes."""
         training, settings, begun = self.training, self.members[0], time.monotonic()
-        training.check_memory()
+        training.check_memory(recorded=True)
         if self.processes.first:
             self._announce()
         state, row = self._begin()
         loggers: list[Logger] = []
         if self.processes.first:
-            progress = ProgressBar(training, row)
-            loggers = [self.table, progress]
+            progress = ProgressBar(training, row, self.watch.diverged)
+            loggers = [self.table, self.watch, progress]
             if settings.tensorboard:
                 loggers.append(TensorBoardLogger(self.runs, self.seeds))
 
@@ -171,12 +180,15 @@ class Batch:
             state, row = self.training.start()
             if first:
                 self.table.log(row)
+                self.watch.log(row)
             return state, row
         saved = Path(broadcast(str(checkpoint.verify(self.checkpoints)) if first else None))
         state, done = checkpoint.restore(saved, self.training.trainer, self.training.share), int(saved.name)
         self.processes.barrier()
-        for run in self.runs if first else ():
+        for run, config, own in zip(self.runs, self.members, self.seeds, strict=True) if first else ():
             run.cut(done)
+            known = divergence.of_run(run, done)
+            self.watch.diverged |= {own.start + seed - config.seed: found for seed, found in known.items()}
         if first:
             print(f"resuming from the checkpoint of env step {done:,}", flush=True)
         updates = self.training.trainer.updates(int(state.rollouts))
@@ -190,7 +202,12 @@ class Batch:
             checkpoint.save(run.checkpoints, int(row["step"][0]), trainer, state, keep=1, seeds=seeds, share=share)
             if not self.processes.first:
                 continue
-            finish.finish(run, self.training.layout, str(config.name), config.diagnostics.q_bias, facts)
+            diverged = {
+                config.seed + place - seeds.start: found
+                for place, found in self.watch.diverged.items()
+                if seeds.start <= place < seeds.stop
+            }
+            finish.finish(run, self.training.layout, str(config.name), config.diagnostics.q_bias, facts, diverged)
 
     def _announce(self) -> None:
         training, config = self.training, self.members[0]
@@ -228,3 +245,8 @@ def train(settings: Mapping[str, Config], folder: Path, budget: int | None = Non
         if RunDirectory(path).summary() is None:
             raise UserError(f"{path} is not finished: another process trains it, or the sweep's plan does not have it")
     return runs
+
+
+def fitting_seeds(config: Config, budget: int) -> int:
+    """`most_seeds` of a run's settings."""
+    return most_seeds(TrainingSession(config).trainer, budget)

@@ -1,9 +1,11 @@
 """What is said of a run before it trains, and at its end."""
 
+from collections.abc import Mapping
 from typing import Any
 
-from matd3_jax.runs import overestimation, summary
+from matd3_jax.runs import divergence, overestimation, summary
 from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.runs.divergence import Divergence
 from matd3_jax.runtime import devices
 from matd3_jax.training import cost
 from matd3_jax.training.session import TrainingSession
@@ -32,10 +34,20 @@ def first_lines(training: TrainingSession, run: RunDirectory, done: int = 0) -> 
     ]
 
 
-def last_lines(training: TrainingSession, run: RunDirectory, found: dict[str, Any]) -> list[str]:
-    """Say what a finished run's summary holds."""
-    settings, lines = training.config, []
+def last_lines(
+    training: TrainingSession, run: RunDirectory, found: dict[str, Any], diverged: Mapping[int, Divergence]
+) -> list[str]:
+    """Say what a finished run's summary holds, and of which seeds."""
+    settings = training.config
+    lines = [f"seed {seed} diverged at env step {one.step:,}: {one.what}" for seed, one in diverged.items()]
+    left = settings.seeds - len(diverged)
     over = f"(95 % interval over {settings.seeds} seeds)"
+    if diverged and not left:
+        return [*lines, "all seeds diverged: there are no means", f"learning curve: {run.curve}"]
+    if diverged:
+        others = "the other seed" if left == 1 else f"the other {left} seeds"
+        lines[-1] += f"; all means are over {others}"
+        over = f"(95 % interval over {left} of {settings.seeds} seeds)"
     for team, final in found["last_tenth"].items():
         lines.append(f"mean training return of {team} over the last tenth: {summary.text(final, over)}")
     if training.eval_every:
@@ -46,7 +58,7 @@ def last_lines(training: TrainingSession, run: RunDirectory, found: dict[str, An
                 lines.append(f"  {name}: {summary.text(final, over)}")
     if settings.diagnostics.q_bias:
         agents, rollouts = training.layout.agents, settings.diagnostics.q_bias_rollouts
-        lines += overestimation.lines(run.read_metrics(), agents, rollouts)
+        lines += overestimation.lines(divergence.without(run.read_metrics(), diverged), agents, rollouts)
         lines.append(f"estimated and true values: {run.q_bias}")
     return [*lines, f"learning curve: {run.curve}"]
 

@@ -5,36 +5,47 @@ from typing import Any
 
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.figures import learning_curves, q_bias
-from matd3_jax.runs import overestimation, summary
+from matd3_jax.runs import divergence, overestimation, summary
 from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.runs.divergence import Divergence
 
 
-def draw(run: RunDirectory, layout: JointLayout, title: str, with_q_bias: bool) -> None:
-    """Draw the figures of a run as far as it has come.
+def draw(
+    run: RunDirectory, layout: JointLayout, title: str, with_q_bias: bool, diverged: Mapping[int, Divergence]
+) -> None:
+    """Draw the figures of a run as far as it has come; means without the seeds that diverged.
 
     Raises UserError where it has no metrics yet.
     """
     metrics = run.read_metrics()
-    learning_curves.learning_curve(run.curve, metrics, title)
-    if with_q_bias:
-        q_bias.draw(run.q_bias, metrics, layout.by_team(), title)
+    learning_curves.learning_curve(run.curve, metrics, title, diverged)
+    sound = divergence.without(metrics, diverged)
+    if with_q_bias and sound["step"].size:
+        q_bias.draw(run.q_bias, sound, layout.by_team(), title)
 
 
 def finish(
-    run: RunDirectory, layout: JointLayout, title: str, with_q_bias: bool, facts: Mapping[str, Any]
+    run: RunDirectory,
+    layout: JointLayout,
+    title: str,
+    with_q_bias: bool,
+    facts: Mapping[str, Any],
+    diverged: Mapping[int, Divergence],
 ) -> dict[str, Any]:
     """Draw the figures of a run that has come to its end, and write its summary, which is returned.
 
     Args:
         facts: times and rates, which only the process that trained knows.
+        diverged: what that process found; the table's own are found again.
 
     Raises UserError where it has no metrics.
     """
-    draw(run, layout, title, with_q_bias)
     metrics = run.read_metrics()
-    last = metrics["step"] == metrics["step"].max()
-    found = summary.summary(metrics, {name: column[last] for name, column in metrics.items()}, **facts)
-    if with_q_bias:
-        found["overestimation"] = overestimation.summary(metrics, layout.agents)
+    diverged = divergence.earliest(divergence.of_table(metrics), diverged)
+    draw(run, layout, title, with_q_bias, diverged)
+    found = summary.summary(metrics, diverged, **facts)
+    sound = divergence.without(metrics, diverged)
+    if with_q_bias and sound["step"].size:
+        found["overestimation"] = overestimation.summary(sound, layout.agents)
     run.write_summary(found)
     return found

@@ -1,13 +1,16 @@
 """Where the rows of the metrics table go while a run trains."""
 
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
 
 from matd3_jax.errors import UserError
+from matd3_jax.runs import divergence
 from matd3_jax.runs.directory import RunDirectory
-from matd3_jax.training.session import Row
+from matd3_jax.runs.divergence import Divergence
+from matd3_jax.training.session import Row, TrainingSession
 
 
 class Logger(Protocol):
@@ -64,6 +67,51 @@ class TensorBoardLogger:
             writer.close()
 
 
+class DivergenceLogger:
+    """Notes which seeds diverged, and tells of each once.
+
+    Args:
+        tell: gets a line the moment a seed diverges.
+        known: what diverged before, by the places of the seeds in the rows.
+        names: what each seed is called, [seeds]; default "seed N".
+    """
+
+    def __init__(
+        self,
+        training: TrainingSession,
+        tell: Callable[[str], object],
+        known: Mapping[int, Divergence] | None = None,
+        names: Sequence[str] | None = None,
+    ):
+        self.training, self.tell, self.names = training, tell, names
+        self.diverged: dict[int, Divergence] = dict(known or {})
+        """By the places of the seeds in the rows."""
+        self.new = 0
+        """How many have diverged since the beginning."""
+
+    def log(self, row: Row) -> None:
+        for seed, wrong in self._wrong(row).items():
+            if seed in self.diverged:
+                continue
+            self.diverged[seed] = wrong
+            self.new += 1
+            name = f"seed {row['seed'][seed]}" if self.names is None else self.names[seed]
+            self.tell(f"{name} diverged at env step {wrong.step:,}: {wrong.what}")
+
+    def _wrong(self, row: Row) -> dict[int, Divergence]:
+        places = np.arange(len(row["seed"]))
+        networks = divergence.of_networks(self.training.networks_finite, places, int(row["step"][0]))
+        return divergence.earliest(divergence.of_table({**row, "seed": places}), networks)
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether all seeds have diverged."""
+        return len(self.diverged) == self.training.share.total
+
+    def close(self) -> None:
+        pass
+
+
 class CallbackLogger:
     """Calls a function with every row."""
 
@@ -88,3 +136,8 @@ class HistoryLogger:
 
     def close(self) -> None:
         pass
+
+
+def warn(line: str) -> None:
+    """Tell a Python caller of a seed that diverged."""
+    warnings.warn(line, RuntimeWarning, stacklevel=2)

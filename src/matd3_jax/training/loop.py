@@ -125,6 +125,10 @@ class TrainLoop:
 
     def abstract_state(self) -> TrainState:
         """Shapes and types of the state, with an empty replay."""
+        return self._abstract_state
+
+    @cached_property
+    def _abstract_state(self) -> TrainState:
         keys = jax.eval_shape(jax.vmap(jax.random.key), jax.ShapeDtypeStruct((self.sharding.padded_seeds,), jnp.int32))
         return jax.eval_shape(self._init, keys)
 

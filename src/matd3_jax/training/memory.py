@@ -1,25 +1,41 @@
 """How much memory training takes, computed before anything is allocated."""
 
 import math
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
 
 import chex
 import jax
 
-from matd3_jax.config import Config
+from matd3_jax.core import rollout
+from matd3_jax.core.agents import JointLayout
+from matd3_jax.envs.environment import Environment
 from matd3_jax.errors import UserError
 from matd3_jax.training.loop import TrainLoop
-from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.sharding import idle_devices
 
 PROCESS = 1_300_000_000
 """Bytes of the process itself: interpreter, libraries, compiler, programs (docs/performance.md)."""
 
 
-def needed(trainer: TrainLoop, seeds: int) -> int:
-    """Bytes that training `seeds` seeds takes at most, the process and its checkpoints included.
+class Part(NamedTuple):
+    """Some of the memory, what it is for, and what it grows with."""
+
+    size: int
+    """Bytes."""
+    what: str
+    setting: str
+    value: int | None = None
+    """Of the setting, where the bytes are proportional to it."""
+
+
+def parts(trainer: TrainLoop, seeds: int, episodes: int = 0) -> dict[str, Part]:
+    """What training `seeds` seeds takes at most besides the process itself.
 
     Args:
         trainer: of any number of seeds; its schedule, environment and algorithms count.
+        episodes: of an evaluation.
     """
     devices = len(jax.local_devices())
     each = idle_devices(devices, seeds, trainer.schedule.batch_size) if trainer.on_cpu else 1
@@ -28,8 +44,68 @@ def needed(trainer: TrainLoop, seeds: int) -> int:
     copies = each * rows  # a seed's state is on all the devices that work on it
     replay = trainer.replay_bytes // (trainer.sharding.padded_seeds * trainer.sharding.devices_per_seed)
     together = shares if trainer.on_cpu else rows  # seeds updated at the same time
-    # A checkpoint is written seed by seed: one seed's replay on its way out, and once more in the writer's hands.
-    return PROCESS + copies * (replay + seed_bytes(trainer)) + together * update_bytes(trainer) + 2 * replay
+    schedule, state = trainer.schedule, trainer.abstract_state()
+    networks = 2 * size(state.groups) // trainer.sharding.padded_seeds
+    others = seed_bytes(trainer) - networks
+    capacity, most = schedule.replay_capacity, max(group.algorithm.num_critics for group in trainer.layout.groups)
+    many = most > 2
+    return {
+        "replay": Part(copies * replay, "the replay", "replay_capacity", capacity),
+        # A checkpoint is written seed by seed: one seed's replay on its way out, and once more in the writer's hands.
+        "checkpoint": Part(2 * replay, "a checkpoint on its way out", "replay_capacity", capacity),
+        "networks": Part(
+            copies * networks,
+            "networks and optimizers",
+            "algo.num_critics" if many else "algo.hidden",
+            most if many else None,
+        ),
+        "environments": Part(copies * others, "environments and a rollout", "num_envs", schedule.num_envs),
+        "updates": Part(together * update_bytes(trainer), "an update", "batch_size", schedule.batch_size),
+        "evaluation": Part(
+            copies * episodes * playing_bytes(trainer.env, trainer.layout), "an evaluation", "eval_episodes", episodes
+        ),
+    }
+
+
+def needed(trainer: TrainLoop, seeds: int) -> int:
+    """Bytes that training `seeds` seeds takes at most, the process and its checkpoints included.
+
+    Args:
+        trainer: of any number of seeds; its schedule, environment and algorithms count.
+    """
+    return PROCESS + sum(part.size for part in parts(trainer, seeds).values())
+
+
+def check(parts: Sequence[Part], free: int, otherwise: str = "") -> None:
+    """Raise UserError, with what takes the most and which setting would fit, where all parts do not fit into `free`
+    bytes. otherwise: what else would help."""
+    total = sum(part.size for part in parts)
+    if total <= free:
+        return
+    most = max(parts, key=lambda part: part.size)
+    alike = sum(part.size for part in parts if part.setting == most.setting)
+    advice = f"a smaller {most.setting}"
+    if most.value is not None:
+        fits = int(most.value * max(0, free - (total - alike)) / alike)
+        advice = f"{most.setting} at most {fits:,}" if fits else f"a much smaller {most.setting}"
+    raise UserError(
+        f"{total / 1e9:,.2f} GB are needed, but only {free / 1e9:,.2f} GB are free; {most.size / 1e9:,.2f} GB for "
+        f"{most.what}: {advice}{otherwise}"
+    )
+
+
+def check_playing(env: Environment, layout: JointLayout, episodes: int, together: int, free: int) -> None:
+    """Raise UserError where `together` times `episodes` episodes cannot be played side by side with `free` bytes."""
+    what = f"{together} x {episodes:,} episodes side by side" if together > 1 else f"{episodes:,} episodes side by side"
+    check([Part(together * episodes * playing_bytes(env, layout), what, "episodes", episodes)], free)
+
+
+def playing_bytes(env: Environment, layout: JointLayout) -> int:
+    """Bytes of an episode that is played besides others: the environment before and after a step, a fresh start, and
+    what the actors compute."""
+    started = jax.eval_shape(partial(rollout.start, env, num_envs=1), jax.eval_shape(jax.random.key, 0))
+    widest = max(max((0, *group.algorithm.hidden)) for group in layout.groups)
+    return 3 * size(started) + 4 * (layout.observation_size + 2 * layout.action_size + 2 * widest * layout.num_agents)
 
 
 def seed_bytes(trainer: TrainLoop) -> int:
@@ -74,11 +150,6 @@ def most_seeds(trainer: TrainLoop, budget: int) -> int:
         low, high = (middle, high) if needed(trainer, middle) <= budget else (low, middle)
     devices = len(jax.local_devices())
     return max(low // devices * devices, min(low, devices))
-
-
-def fitting_seeds(config: Config, budget: int) -> int:
-    """`most_seeds` of a run's settings."""
-    return most_seeds(TrainingSession(config).trainer, budget)
 
 
 def size(tree: chex.ArrayTree) -> int:

@@ -2,11 +2,13 @@
 
 import sys
 import time
+from collections.abc import Mapping
 
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
+from matd3_jax.runs.divergence import Divergence, of_seeds
 from matd3_jax.stats.text import plus_minus
 from matd3_jax.training.clock import compiling
 from matd3_jax.training.session import Row, TrainingSession
@@ -23,9 +25,12 @@ class ProgressBar:
 
     Args:
         row: where the run stands.
+        diverged: seeds that are left out of the returns, by their places in the rows, with their divergences; others
+            may come into it later.
     """
 
-    def __init__(self, training: TrainingSession, row: Row):
+    def __init__(self, training: TrainingSession, row: Row, diverged: Mapping[int, Divergence] | None = None):
+        self.diverged: Mapping[int, Divergence] = {} if diverged is None else diverged
         self.training, self.clock = training, training.clock
         self.total, self.seeds = training.total_steps, training.share.total
         self.step, self.updates = self.begun_step, self.begun_updates = int(row["step"][0]), int(row["updates"][0])
@@ -36,6 +41,8 @@ class ProgressBar:
         self.returns: dict[str, tuple[int, np.ndarray]] = {}
         """The last training return of each team, with its env step."""
         self.evaluation: Row = {}
+        self.numbers = np.arange(self.seeds)
+        """[seeds] what the seeds are called."""
         self._note(row)
         self.printed = 0.0
         self.console = Console(file=sys.stdout)
@@ -116,6 +123,7 @@ class ProgressBar:
 
     def _note(self, row: Row) -> None:
         self.step, self.updates = int(row["step"][0]), int(row["updates"][0])
+        self.numbers = row.get("seed", self.numbers)
         for name, values in row.items():
             if name.startswith("return_") and not np.isnan(values).all():
                 self.returns[name.removeprefix("return_")] = self.step, values
@@ -125,7 +133,10 @@ class ProgressBar:
 
     def _return_texts(self) -> list[str]:
         """Of each team. Long episodes need not end in an interval: then the return of an earlier one with its env step,
-        and before there is one the evaluation alone."""
+        and before there is one the evaluation alone. Behind them, of which seeds, where some have diverged."""
+        whose = [self._whose()] if self.diverged else []
+        if len(self.diverged) == self.seeds:
+            return whose
         found = []
         teams = [name.removeprefix("eval_return_") for name in self.evaluation if name.startswith("eval_return_")]
         for team in dict.fromkeys([*self.returns, *teams]):
@@ -135,8 +146,15 @@ class ProgressBar:
                 continue
             step, values = self.returns[team]
             earlier = f" at {step:,}" if step < self.step else ""
-            found.append(f"{team} {_spread(values)}{earlier}" + (f" ({evaluation})" if evaluation else ""))
-        return found or [f"no episode has ended since env step {self.begun_step:,}"]
+            found.append(f"{team} {self._spread(values)}{earlier}" + (f" ({evaluation})" if evaluation else ""))
+        return (found or [f"no episode has ended since env step {self.begun_step:,}"]) + whose
+
+    def _whose(self) -> str:
+        """Of which seeds the returns are."""
+        if len(set(self.numbers.tolist())) < len(self.numbers):  # of several runs side by side
+            return f"{self.seeds - len(self.diverged)} of {self.seeds} seeds, {len(self.diverged)} diverged"
+        by_number = {int(self.numbers[place]): found for place, found in sorted(self.diverged.items())}
+        return of_seeds(self.seeds, by_number)
 
     def _evaluation_text(self, team: str) -> str:
         """The team's last evaluation, and how fast a robot went in it; empty before the first."""
@@ -144,16 +162,22 @@ class ProgressBar:
         if values is None:
             return ""
         speed = self.evaluation.get("eval_forward_velocity")
-        metres = "" if speed is None else f", {np.nanmean(speed):.2f} m/s"
-        return f"evaluation {_spread(values)}{metres}"
+        metres = "" if speed is None else f", {self._sound(speed).mean():.2f} m/s"
+        return f"evaluation {self._spread(values)}{metres}"
 
+    def _sound(self, values: np.ndarray) -> np.ndarray:
+        """Without seeds that diverged."""
+        return np.delete(values, [place for place in self.diverged if place < len(values)])
 
-def _spread(values: np.ndarray) -> str:
-    """Mean, and standard deviation over the seeds, of those that have a number."""
-    values = values[~np.isnan(values)]
-    if not len(values):
-        return "nan"
-    return plus_minus(values.mean(), values.std(ddof=1) if len(values) > 1 else None, ".1f", ".1f")
+    def _spread(self, values: np.ndarray) -> str:
+        """Mean, and standard deviation over the seeds that have not diverged; of how many, where an episode has not
+        ended with all of them."""
+        sound = self._sound(values)
+        ended = sound[~np.isnan(sound)]
+        if not len(ended):
+            return "nan"
+        fewer = f", {len(ended)} of {len(sound)} seeds" if len(ended) < len(sound) else ""
+        return plus_minus(ended.mean(), ended.std(ddof=1) if len(ended) > 1 else None, ".1f", ".1f") + fewer
 
 
 def _duration(seconds: float) -> str:

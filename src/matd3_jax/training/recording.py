@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,13 +12,14 @@ from matd3_jax import config
 from matd3_jax.config import Config
 from matd3_jax.envs.environment import Environment
 from matd3_jax.errors import UserError
-from matd3_jax.runs import lock
+from matd3_jax.runs import divergence, lock
 from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.runs.divergence import Divergence
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.training import announcement, checkpoint, finish
-from matd3_jax.training.loggers import Logger, TableLogger, TensorBoardLogger
+from matd3_jax.training.loggers import DivergenceLogger, Logger, TableLogger, TensorBoardLogger, warn
 from matd3_jax.training.progress import ProgressBar
 from matd3_jax.training.run import Outcome, run
 from matd3_jax.training.session import Row, TrainingSession
@@ -42,7 +43,8 @@ class Recorder:
         processes: which train together; the first alone writes and speaks.
         heed_signals: whether SIGINT, SIGTERM and SIGHUP end a run after a checkpoint (of a program of its own), or
             stay with the program that calls.
-        say: gets the lines about a run; None: nothing is said, nor a progress bar shown.
+        say: gets the lines about a run; None: nothing is said, nor a progress bar shown, but of a seed that diverges a
+            RuntimeWarning tells.
         loggers: get the rows of the metrics table, too.
     """
 
@@ -109,7 +111,7 @@ class Recorder:
 
     def _checked(self, settings: Config, env: Environment | None) -> TrainingSession:
         training = TrainingSession(settings, env, processes=self.processes)
-        training.check_memory()
+        training.check_memory(recorded=True)
         if settings.tensorboard:
             TensorBoardLogger.check()
         return training
@@ -131,7 +133,26 @@ class Recorder:
             directory.append(row)
             for logger in self.loggers:
                 logger.log(row)
-        return self._to_the_end(training, directory, state, row, stop, fresh=True)
+        watch = self._watch(training, {})
+        if self.processes.first:
+            watch.log(row)
+        return self._to_the_end(training, directory, state, row, stop, watch, fresh=True)
+
+    def _watch(self, training: TrainingSession, diverged: Mapping[int, Divergence]) -> DivergenceLogger:
+        """Knows what has diverged so far, given by the numbers of the seeds."""
+        known = {seed - training.config.seed: found for seed, found in diverged.items()}
+        return DivergenceLogger(training, self.say if self.shows_progress else warn, known)
+
+    def _diverged(
+        self, training: TrainingSession, directory: RunDirectory, state: TrainState, step: int
+    ) -> dict[int, Divergence]:
+        """Which seeds of a checkpoint of env step `step` had diverged, by their numbers, in the first process."""
+        finite = self.processes.gather({"finite": training.finite(state)})["finite"]
+        if not self.processes.first:
+            return {}
+        numbers = range(training.config.seed, training.config.seed + training.config.seeds)
+        found = divergence.of_networks(finite, numbers, step)
+        return divergence.earliest(divergence.of_run(directory, step), found)
 
     def _from_checkpoint(
         self, training: TrainingSession, directory: RunDirectory, saved: Path, stop: Stop | None
@@ -145,11 +166,12 @@ class Recorder:
                     "total_steps="
                 )
             state = checkpoint.restore(saved, training.trainer, training.share)
+            watch = self._watch(training, self._diverged(training, directory, state, done))
             if self.processes.first:
                 self.say(f"{directory.path} has come to its end; its figures and its summary are made")
                 self._notes(training, directory, done)
-                self._finish(training, directory, {})
-            return Recorded(directory, training, Outcome(state, row, None))
+                self._finish(training, directory, {}, watch)
+            return Recorded(directory, training, Outcome(state, row, None, watch.diverged))
         if self.processes.first:
             for line in announcement.first_lines(training, directory, done):
                 self.say(line)
@@ -161,7 +183,10 @@ class Recorder:
             config.write(training.config, directory.path / "config.yaml")
             self._notes(training, directory, done)
         row["updates"] = np.array([training.trainer.updates(int(state.rollouts))])
-        return self._to_the_end(training, directory, state, row, stop)
+        diverged = self._diverged(training, directory, state, done)
+        if diverged:
+            self.say(f"note: {divergence.which(diverged)}")
+        return self._to_the_end(training, directory, state, row, stop, self._watch(training, diverged))
 
     def _notes(self, training: TrainingSession, directory: RunDirectory, done: int) -> None:
         """Take the rows after env step `done` out of the metrics table, and say what it lacks."""
@@ -182,16 +207,17 @@ class Recorder:
         state: TrainState,
         row: Row,
         stop: Stop | None,
+        watch: DivergenceLogger,
         fresh: bool = False,
     ) -> Recorded:
-        """Train to the end, or until a signal comes."""
+        """Train to the end, or until a signal comes or a seed diverges that must not."""
         settings, begun = training.config, time.monotonic()
         loggers: list[Logger] = []
         progress = None
         if self.processes.first:
-            loggers = [TableLogger([directory])]
+            loggers = [TableLogger([directory]), watch]
             if self.shows_progress:
-                progress = ProgressBar(training, row)
+                progress = ProgressBar(training, row, watch.diverged)
                 loggers.append(progress)
             if settings.tensorboard:
                 loggers.append(TensorBoardLogger([directory]))
@@ -205,16 +231,20 @@ class Recorder:
         step = int(outcome.row["step"][0])
         save(outcome.state, step)
         if self.processes.first:
-            if outcome.stopped is None:
+            if outcome.finished:
                 rates = {} if progress is None else progress.rates()
-                self._finish(training, directory, {"seconds": round(time.monotonic() - begun, 1), **rates})
+                self._finish(training, directory, {"seconds": round(time.monotonic() - begun, 1), **rates}, watch)
             else:
-                title = announcement.title(training)
-                finish.draw(directory, training.layout, title, settings.diagnostics.q_bias)
+                title, diverged = announcement.title(training), self._by_number(training, watch)
+                finish.draw(directory, training.layout, title, settings.diagnostics.q_bias, diverged)
         return Recorded(directory, training, outcome)
 
-    def _finish(self, training: TrainingSession, directory: RunDirectory, facts: dict) -> None:
-        title = announcement.title(training)
-        found = finish.finish(directory, training.layout, title, training.config.diagnostics.q_bias, facts)
-        for line in announcement.last_lines(training, directory, found):
+    def _finish(self, training: TrainingSession, directory: RunDirectory, facts: dict, watch: DivergenceLogger) -> None:
+        title, diverged = announcement.title(training), self._by_number(training, watch)
+        found = finish.finish(directory, training.layout, title, training.config.diagnostics.q_bias, facts, diverged)
+        for line in announcement.last_lines(training, directory, found, diverged):
             self.say(line)
+
+    @staticmethod
+    def _by_number(training: TrainingSession, watch: DivergenceLogger) -> dict[int, Divergence]:
+        return {training.config.seed + place: found for place, found in sorted(watch.diverged.items())}

@@ -1,12 +1,13 @@
 """One training run from where it stands to its end: advance, log, checkpoint, stop."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from signal import Signals
 from typing import NamedTuple
 
+from matd3_jax.runs.divergence import Divergence
 from matd3_jax.runtime.signals import Stop
-from matd3_jax.training.loggers import Logger
+from matd3_jax.training.loggers import DivergenceLogger, Logger
 from matd3_jax.training.session import Row, TrainingSession
 from matd3_jax.training.state import TrainState
 
@@ -21,7 +22,16 @@ class Outcome(NamedTuple):
     row: Row
     """Of the last logging interval."""
     stopped: Signals | None
-    """The signal that ended it; None where it was trained to its end."""
+    """The signal that ended it; None where none did."""
+    diverged: Mapping[int, Divergence]
+    """By the places of the seeds in the rows; of several processes in the first of them."""
+    halted: bool = False
+    """Whether `on_divergence=stop` ended it."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether it was trained to its end."""
+        return self.stopped is None and not self.halted
 
 
 def run(
@@ -33,11 +43,13 @@ def run(
     stop: Stop | None = None,
     save_first: bool = False,
 ) -> Outcome:
-    """Train interval after interval to the end, or until a signal comes; the loggers are closed then.
+    """Train interval after interval to the end, or until a signal comes, or with `on_divergence=stop` until a seed
+    diverges; the loggers are closed then.
 
     Args:
         state, row: where the run stands; the state is donated.
-        loggers: get the row of each interval; of several processes those of the first alone.
+        loggers: get the row of each interval; of several processes those of the first alone. Its `DivergenceLogger`
+            knows which seeds have diverged.
         save: writes a checkpoint of a state and its env step: called every `checkpoint_every` env steps and every
             `checkpoint_minutes`, but not at the end. Where writing takes long it waits until the training since has
             taken `SHARE` times as long.
@@ -64,19 +76,29 @@ def run(
     def stopped() -> Signals | None:
         return None if stop is None else stop.agreed(training.processes)
 
+    watch = next((logger for logger in loggers if isinstance(logger, DivergenceLogger)), None)
+
+    def halted() -> bool:
+        if training.config.on_divergence != "stop":
+            return False
+        return bool(training.processes.agree(int(watch is not None and watch.new > 0)))
+
+    halt = False
     try:
         if save is not None and save_first and (every or minutes):
             write(state)
         signal = stopped()
-        while step < training.total_steps and signal is None:
+        while step < training.total_steps and signal is None and not halt:
             state, row = training.advance(state)
             step = int(row["step"][0])
             for logger in loggers:
                 logger.log(row)
             if due():
                 write(state)
-            signal = stopped()
+            signal, halt = stopped(), halted()
     finally:
         for logger in loggers:
             logger.close()
-    return Outcome(state, row, signal if step < training.total_steps else None)
+    diverged = {} if watch is None else watch.diverged
+    left = step < training.total_steps
+    return Outcome(state, row, signal if left else None, diverged, left and halt and signal is None)

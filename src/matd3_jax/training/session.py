@@ -21,11 +21,12 @@ from matd3_jax.errors import UserError
 from matd3_jax.runs import overestimation
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
+from matd3_jax.training import memory
 from matd3_jax.training.clock import Clock
 from matd3_jax.training.evaluator import Evaluator
 from matd3_jax.training.loop import Program, TrainLoop
 from matd3_jax.training.schedule import Schedule
-from matd3_jax.training.state import Metrics, TrainState
+from matd3_jax.training.state import Metrics, TrainState, networks_finite
 
 Row = dict[str, np.ndarray]
 """Columns of the metrics table for one interval: each [seeds]; "step" and "seed" among them."""
@@ -109,6 +110,8 @@ class TrainingSession:
         kept = config.diagnostics.q_bias_rollouts if config.diagnostics.q_bias else 0
         self.trainer = TrainLoop(self.env, self.layout, schedule, hyper, seeds, local, q_bias_pairs=kept, **options)
         self.evaluator = Evaluator(self.trainer)
+        self.networks_finite = np.ones(self.share.total, bool)
+        """[seeds of all processes, in the first of them] whether each seed's networks were finite in the last row."""
 
     def _hyper(self, team: str) -> HyperParams:
         """The team's hyper-parameters, leaves [seeds]."""
@@ -130,14 +133,15 @@ class TrainingSession:
             f"{s.num_agents}, {'more 1, ' if s.n_step > 1 else ''}x' {s.observation_size}, discount 1)"
         )
 
-    def check_memory(self) -> None:
-        """Raise UserError, with the arithmetic, if the replay cannot fit."""
-        free = devices.free_memory(self.processes.local)
-        if self.trainer.replay_bytes > free:
-            raise UserError(
-                f"{self.memory}, but only {free / 1e9:.2f} GB are free: fewer seeds, or replay_capacity at most "
-                f"{int(free * self.trainer.schedule.replay_capacity / self.trainer.replay_bytes):,}"
-            )
+    def check_memory(self, recorded: bool = False) -> None:
+        """Raise UserError, with the arithmetic, unless everything that training takes fits into the memory that is
+        free. recorded: checkpoints are written, too."""
+        parts = memory.parts(self.trainer, len(self.seeds), self.config.eval_episodes if self.eval_every else 0)
+        if not (recorded and self.trainer.on_cpu):
+            del parts["checkpoint"]  # an accelerator's are made in the host's memory
+        parts["replay"] = parts["replay"]._replace(what=self.memory)
+        otherwise = ", or fewer seeds" if len(self.seeds) > 1 else ""
+        memory.check(list(parts.values()), devices.free_memory(self.processes.local), otherwise)
 
     # ---- running -----------------------------------------------------------------------------------------------------
 
@@ -151,7 +155,7 @@ class TrainingSession:
         state, episodes = self.trainer.warm_up(self.trainer.init(self.keys()))
         row = self.row(state, Metrics(episodes, None))  # type: ignore[arg-type]
         state, columns = self._evaluated(state, due=True)
-        return state, self.processes.gather(row | columns)
+        return state, self._gathered(state, row | columns)
 
     @cached_property
     def interval(self) -> Program:
@@ -166,7 +170,18 @@ class TrainingSession:
             state, metrics = jax.block_until_ready(self.interval(state))
         row = self.row(state, metrics)
         state, columns = self._evaluated(state, self._due(before, self.step(state)))
-        return state, self.processes.gather(row | columns)
+        return state, self._gathered(state, row | columns)
+
+    def _gathered(self, state: TrainState, row: Row) -> Row:
+        """The row with the seeds of all processes in the first of them; notes whose networks are finite."""
+        finite = self.finite(state)
+        row = self.processes.gather({**row, "finite": finite})
+        self.networks_finite = row.pop("finite")
+        return row
+
+    def finite(self, state: TrainState) -> np.ndarray:
+        """Whether the networks of each seed of this process, and their optimizers, have finite numbers only."""
+        return np.asarray(networks_finite(state))[: len(self.seeds)]
 
     def step(self, state: TrainState) -> int:
         """Env steps of each seed so far."""

@@ -71,3 +71,14 @@ def initial(
     fresh = running_statistics.initial(layout.observation_size)
     spread = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (keys.shape[0], *leaf.shape)), fresh)
     return state._replace(statistics=spread)
+
+
+def networks_finite(state: TrainState) -> chex.Array:
+    """[seeds] whether networks, targets and optimizers of a seed have finite numbers only."""
+    return _finite(state.groups)
+
+
+@jax.jit
+def _finite(groups: chex.ArrayTree) -> chex.Array:
+    each = [jnp.isfinite(leaf).reshape(leaf.shape[0], -1).all(axis=1) for leaf in jax.tree.leaves(groups)]
+    return jnp.stack(each).all(axis=0)

@@ -13,8 +13,8 @@ from matd3_jax.config.schema import TEXTS
 from matd3_jax.envs.check import check
 from matd3_jax.envs.environment import Environment
 from matd3_jax.runtime import devices
-from matd3_jax.training.loggers import CallbackLogger, HistoryLogger, Logger
-from matd3_jax.training.run import run
+from matd3_jax.training.loggers import CallbackLogger, DivergenceLogger, HistoryLogger, Logger, warn
+from matd3_jax.training.run import Outcome, run
 from matd3_jax.training.session import Row, TrainingSession
 from matd3_jax.training.state import TrainState
 
@@ -34,6 +34,8 @@ class Result:
     """Columns of the metrics table, each [seeds, intervals]; "step" is env steps of each seed."""
     run_dir: Path | None = None
     """Where the run has its files, if it has."""
+    diverged: dict[int, int] = dataclasses.field(default_factory=dict)
+    """Seeds whose losses, values, returns or networks were not finite, with the env step at which they first were."""
 
     def evaluate(self, episodes: int = 100, deterministic: bool = True, seed: int = 0) -> np.ndarray:
         """Undiscounted returns [seeds, episodes, agents] of whole episodes (see `TrainingSession.evaluate`)."""
@@ -60,6 +62,8 @@ def train(
             figures, summary; `resume` trains the run on. None: no files are written.
         callback: called with every interval's row (columns [seeds]) as it comes.
         loggers: get the same rows, and are closed at the end (see `training.loggers.Logger`).
+
+    A seed that diverges is told of by a RuntimeWarning, and is in the result's `diverged`.
 
     Raises UserError for settings that are unknown or impossible, and for an environment that breaks the contract
     (`envs.check`).
@@ -89,8 +93,10 @@ def train(
     history = HistoryLogger(row)
     for logger in every:
         logger.log(row)
-    outcome = run(training, state, row, [history, *every])
-    return Result(config, training, outcome.state, stack(history.rows))
+    watch = DivergenceLogger(training, warn)
+    watch.log(row)
+    outcome = run(training, state, row, [history, watch, *every])
+    return Result(config, training, outcome.state, stack(history.rows), diverged=_diverged(config, outcome))
 
 
 def resume(
@@ -132,7 +138,12 @@ def _result(recorded: "Recorded") -> Result:
     seeds = np.unique(table["seed"])
     columns = {name: np.stack([column[table["seed"] == seed] for seed in seeds]) for name, column in table.items()}
     training = recorded.training
-    return Result(training.config, training, recorded.outcome.state, columns, recorded.directory.path)
+    diverged = _diverged(training.config, recorded.outcome)
+    return Result(training.config, training, recorded.outcome.state, columns, recorded.directory.path, diverged)
+
+
+def _diverged(config: Config, outcome: Outcome) -> dict[int, int]:
+    return {config.seed + place: found.step for place, found in sorted(outcome.diverged.items())}
 
 
 def stack(rows: list[Row]) -> dict[str, np.ndarray]:

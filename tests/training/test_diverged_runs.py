@@ -1,0 +1,135 @@
+"""Runs one of whose seeds diverges: what is said, left out and left behind; the other seeds know nothing of it."""
+
+import csv
+import json
+import shutil
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import matd3_jax
+from matd3_jax import config
+from matd3_jax.cli import evaluate, render, train
+from matd3_jax.errors import UserError
+from matd3_jax.stats.intervals import mean_interval
+from matd3_jax.training import checkpoint
+from matd3_jax.training.recording import Recorder
+from matd3_jax.training.session import TrainingSession
+from matd3_jax.training.state import networks_finite
+
+SMALL = [
+    "env=point_reach", "algo=iddpg", "seeds=3", "seed=4", "total_steps=1200", "learning_starts=400", "num_envs=4",
+    "rollout_length=5", "batch_size=32", "replay_capacity=800", "algo.hidden=[8]", "log_every=200", "eval_every=400",
+    "eval_episodes=2",
+]  # fmt: skip
+LOST, SOUND = 5, (4, 6)
+
+pytestmark = pytest.mark.usefixtures("quick_jit")
+
+
+@pytest.fixture
+def blown(monkeypatch):
+    """Seed 5 alone learns with an enormous rate."""
+    hyper = TrainingSession._hyper
+
+    def one(self, team):
+        found = hyper(self, team)
+        rate = np.where(self.seeds == LOST, 1e30, found.critic_lr).astype(np.float32)
+        return found._replace(critic_lr=rate, actor_lr=np.where(self.seeds == LOST, rate, found.actor_lr))
+
+    monkeypatch.setattr(TrainingSession, "_hyper", one)
+
+
+def table(path):
+    with (path / "metrics.csv").open(newline="") as file:
+        return [row for row in csv.DictReader(file) if int(row["seed"]) != LOST]
+
+
+def test_a_seed_that_diverges_is_told_of_and_left_out(blown, tmp_path, monkeypatch, capsys):
+    said, path = [], tmp_path / "run"
+    recorded = Recorder(say=said.append).start(config.load(SMALL), path)
+    (begin,) = {found.step for found in recorded.outcome.diverged.values()}
+    assert recorded.outcome.finished and list(recorded.outcome.diverged) == [1]
+    told = [line for line in said if line.startswith(f"seed {LOST} diverged at env step {begin:,}: ")]
+    assert len(told) == 2  # when it happens, and at the end
+    assert told[1].endswith("; all means are over the other 2 seeds")
+    assert f"| 2 of 3 seeds, seed {LOST} diverged at {begin:,}" in capsys.readouterr().out
+    assert any("(95 % interval over 2 of 3 seeds)" in line for line in said)
+    # The means are those of the others' rows.
+    summary = json.loads((path / "summary.json").read_text(), parse_constant=pytest.fail)
+    assert summary["diverged"] == {str(LOST): begin}
+    rows = table(path)
+    last = [float(row["eval_return_agents"]) for row in rows[-2:]]
+    np.testing.assert_allclose(summary["last_evaluation"]["return_agents"], mean_interval(np.array(last)), rtol=1e-6)
+    # Finished once more from what it left: the same.
+    (path / "summary.json").unlink()
+    Recorder().resume(path)
+    again = json.loads((path / "summary.json").read_text())
+    assert all(summary[key] == value for key, value in again.items())
+
+    # The commands after it.
+    assert evaluate.main([f"run={path}", "episodes=2"]) == 0
+    shown = capsys.readouterr().out
+    assert f"seed {LOST} (diverged)" in shown and "seed 4 (diverged)" not in shown and "2 of 3 seeds" in shown
+    with (path / "evaluation.csv").open(newline="") as file:
+        assert {(int(row["seed"]), row["diverged"]) for row in csv.DictReader(file)} == {(4, "0"), (5, "1"), (6, "0")}
+    with pytest.raises(UserError, match=f"seed={LOST} of .* diverged: .*; they are with seed=4, 6"):
+        render.main([f"run={path}", f"seed={LOST}"])
+
+    # What the others learn is what they learn beside a sound seed.
+    monkeypatch.undo()
+    Recorder().start(config.load(SMALL), tmp_path / "sound")
+    assert table(path) == table(tmp_path / "sound")
+
+
+def test_stop_ends_the_run_with_a_checkpoint(blown, tmp_path, capsys):
+    assert train.main([*SMALL, f"out={tmp_path}", "name=run", "on_divergence=stop"]) == 3
+    out = capsys.readouterr().out
+    step = checkpoint.steps(tmp_path / "run" / "checkpoints")[-1]
+    assert step < 1200 and f"stopped at env step {step:,} since a seed diverged; go on with:" in out
+    assert not (tmp_path / "run" / "summary.json").exists() and (tmp_path / "run" / "learning_curve.png").exists()
+    # Resumed, it goes on: no other seed diverges.
+    assert train.main([f"resume={tmp_path / 'run'}"]) == 0
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["diverged"] == {str(LOST): step}
+
+
+def test_a_run_all_of_whose_seeds_diverge_has_no_means(tmp_path, capsys):
+    assert train.main([*SMALL, f"out={tmp_path}", "name=run", "algo.lr=1e30"]) == 3
+    out = capsys.readouterr().out
+    assert "none of 3 seeds" in out and "all seeds diverged: there are no means" in out and "evaluation -" not in out
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text(), parse_constant=pytest.fail)
+    assert len(summary["diverged"]) == 3 and summary["last_tenth"] == {} and "last_evaluation" not in summary
+
+
+def test_from_python_it_is_a_warning(blown):
+    options = dict(text.split("=") for text in SMALL if not text.startswith(("env=", "algo")))
+    with pytest.warns(RuntimeWarning, match=f"seed {LOST} diverged at env step"):
+        result = matd3_jax.train("algo.hidden=[8]", env="point_reach", algo="iddpg", **options)
+    assert list(result.diverged) == [LOST]
+    step, losses = result.metrics["step"][0], result.metrics["agent_0_critic_loss"]
+    assert result.diverged[LOST] == step[~np.isfinite(losses[1]) & (result.metrics["updates"][1] > 0)][0]
+
+
+def test_networks_that_no_loss_tells_of(tmp_path):
+    """A weight of -inf before a ReLU leaves outputs finite."""
+    settings = config.load(SMALL)
+    recorded = Recorder().start(settings, tmp_path / "run")
+    training, state = recorded.training, recorded.outcome.state
+    assert training.finite(state).tolist() == [True] * 3
+    group = state.groups[0]
+    actor = {**group.actor, "bias_0": group.actor["bias_0"].at[1, 0, 0].set(-jnp.inf)}
+    broken = state._replace(groups=(group._replace(actor=actor), *state.groups[1:]))
+    assert training.finite(broken).tolist() == [True, False, True]
+    assert np.asarray(networks_finite(broken)).tolist()[:3] == [True, False, True]
+    step = int(recorded.outcome.row["step"][0])
+    shutil.rmtree(tmp_path / "run" / "checkpoints")
+    checkpoint.save(tmp_path / "run" / "checkpoints", step, training.trainer, broken, 1)
+    (tmp_path / "run" / "summary.json").unlink()
+    said = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Recorder(say=said.append).resume(tmp_path / "run")
+    assert any(line.startswith("seed 5 diverged at env step") and "networks are not finite" in line for line in said)
+    assert recorded.directory.summary()["diverged"] == {"5": step}
