@@ -137,7 +137,7 @@ def verify(folder: Path, step: int | None = None) -> Path:
         raise UserError(f"{folder} holds no checkpoint of step {step}; there: {', '.join(map(str, found))}")
     path = folder.resolve() / str(step)
     try:
-        wanted = json.loads((path / "checksums.json").read_text())
+        wanted = json.loads((path / "checksums.json").read_text(encoding="utf-8"))
         damaged = next((name for name, digest in wanted.items() if _digest(path / name) != digest), None)
     except FileNotFoundError as error:
         damaged = f"{Path(str(error.filename)).relative_to(path)} is missing"

@@ -1,12 +1,15 @@
 """What a run shows while it goes: a bar on a terminal, a line every now and then elsewhere."""
 
+import contextlib
 import sys
 import time
+from collections.abc import Iterator
 
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
+from matd3_jax.runtime.terminal import say
 from matd3_jax.stats.text import plus_minus
 from matd3_jax.training.clock import compiling
 from matd3_jax.training.session import Row, TrainingSession
@@ -44,7 +47,8 @@ class ProgressBar:
             columns = TextColumn("{task.percentage:>3.0f}%"), BarColumn(20), TextColumn("{task.description}")
             self.bar = Progress(*columns, console=self.console, refresh_per_second=4)
             self.task = self.bar.add_task("compiling", total=self.total, completed=self.step)
-            self.bar.start()
+            with _safely():
+                self.bar.start()
 
     def log(self, row: Row) -> None:
         """Show one more interval."""
@@ -52,9 +56,10 @@ class ProgressBar:
         self._note(row)
         text = self.text()
         if self.bar is not None:
-            self.bar.update(self.task, completed=self.step, description=text)
+            with _safely():
+                self.bar.update(self.task, completed=self.step, description=text)
         elif self.now - self.printed >= SECONDS_BETWEEN_LINES or self.step >= self.total:
-            print(f"{100 * self.step / self.total:3.0f}% {text}", flush=True)
+            say(f"{100 * self.step / self.total:3.0f}% {text}")
             self.printed = self.now
 
     def text(self) -> str:
@@ -83,7 +88,8 @@ class ProgressBar:
 
     def close(self) -> None:
         if self.bar is not None:
-            self.bar.stop()
+            with _safely():
+                self.bar.stop()
 
     # ---- time, since the bar began -----------------------------------------------------------------------------------
 
@@ -146,6 +152,13 @@ class ProgressBar:
         speed = self.evaluation.get("eval_forward_velocity")
         metres = "" if speed is None else f", {np.nanmean(speed):.2f} m/s"
         return f"evaluation {_spread(values)}{metres}"
+
+
+@contextlib.contextmanager
+def _safely() -> Iterator[None]:
+    """Go on where the terminal is gone or lacks the letters: showing progress ends no run."""
+    with contextlib.suppress(OSError, ValueError):
+        yield
 
 
 def _spread(values: np.ndarray) -> str:
