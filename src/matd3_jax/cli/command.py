@@ -13,7 +13,7 @@ from matd3_jax.cli import arguments, options
 from matd3_jax.cli.options import Command
 from matd3_jax.errors import OptionError, UserError
 from matd3_jax.runtime import outside
-from matd3_jax.runtime.terminal import complain, say
+from matd3_jax.runtime.terminal import complain, leave, say
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -27,7 +27,7 @@ def start(name: str, argv: Sequence[str]) -> int:
     module = importlib.import_module(f"matd3_jax.cli.{name}")
     from matd3_jax.runtime import devices  # imports JAX, which help does without
 
-    with devices.single_precision():
+    with devices.standard_numerics():
         return module.main(argv)
 
 
@@ -72,7 +72,9 @@ def run(main: Callable[[Sequence[str]], int], command: Command | None = None) ->
     if command is not None and options.asks_for_help(sys.argv[1:]):
         say(command.help())
         sys.exit(0)
-    sys.exit(code(main, sys.argv[1:]))
+    exit_code = code(main, sys.argv[1:])
+    leave()
+    sys.exit(exit_code)
 
 
 def prepare_output() -> None:

@@ -109,6 +109,7 @@ def read(overrides: Sequence[str], samples: int | None, seed: int) -> tuple[list
         except UserError as error:
             swept = ", ".join(f"{key}={value}" for key, value in values.items())
             raise UserError(f"{error} (with {swept})" if values else str(error)) from error
+    batching.check_seeds(settings)
     return chosen, settings
 
 

@@ -48,7 +48,7 @@ def load(overrides: Sequence[str] = (), known: Sequence[str] = ()) -> Config:
         valid = known_names(group)
         for value in (o.value() for o in parsed if o.key_or_group == group):
             if value not in valid:
-                raise UserError(f"no {noun} is called {value!r}; {nearest(value, valid)}")
+                raise UserError(f"{group}: no {noun} is called {value!r}; {nearest(value, valid)}")
     # Files first: Hydra wants them chosen before their values are changed.
     chosen = [o for o in parsed if o.key_or_group in GROUPS]
     values = [o for o in parsed if o.key_or_group not in GROUPS and not _is_text(o)]

@@ -32,6 +32,10 @@ def prepare() -> None:
         # Whole networks fused into one library call run at half the speed of single products in 0.10, at nine tenths in
         # 0.11. Other versions may not know the flag, and end the process over it.
         os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_experimental_ynn_fusion_type=LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT"
+    if jaxlib.__version__.startswith("0.11.") and "JAX_USE_SHARDY_PARTITIONER" not in os.environ:
+        # Shardy's ManualComputationUnusedInputsPattern of 0.11.2 ends the process (a segmentation fault) at robots that
+        # MJX steps on several devices; the older partitioner compiles them.
+        jax.config.update("jax_use_shardy_partitioner", False)
     if "JAX_NUM_CPU_DEVICES" in os.environ or "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
         return
     try:
@@ -53,9 +57,10 @@ def cache_folder() -> Path | None:
 
 
 @contextlib.contextmanager
-def single_precision() -> Iterator[None]:
-    """Compute in float32 and int32 within, whatever JAX_ENABLE_X64 says: the numbers are the same with and without."""
-    with jax.enable_x64(False):
+def standard_numerics() -> Iterator[None]:
+    """Compute in float32 and int32 within, and by NumPy's rules of promotion, whatever JAX_ENABLE_X64,
+    JAX_NUMPY_DTYPE_PROMOTION and JAX_NUMPY_RANK_PROMOTION say: the numbers are the same."""
+    with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
 
 

@@ -132,7 +132,7 @@ class Processes:
 
     def check_same(self, text: str, what: str) -> None:
         """Raise UserError unless all give the same text. what: names it in the message."""
-        texts = self.gather_messages(text.encode())
+        texts = self.gather_messages(text.encode(errors="surrogateescape"))
         for index, other in enumerate(texts):
             if other != texts[0]:
                 raise UserError(f"process {index} was given {what} other than process 0: {other.decode()}")

@@ -35,13 +35,13 @@ class Result:
     run_dir: Path | None = None
     """Where the run has its files, if it has."""
 
-    @devices.single_precision()
+    @devices.standard_numerics()
     def evaluate(self, episodes: int = 100, deterministic: bool = True, seed: int = 0) -> np.ndarray:
         """Undiscounted returns [seeds, episodes, agents] of whole episodes (see `TrainingSession.evaluate`)."""
         return self.training.evaluate(self.state, episodes, deterministic, seed).episode_return
 
 
-@devices.single_precision()
+@devices.standard_numerics()
 def train(
     *overrides: str,
     env: str | Environment = "simple_spread",
@@ -95,7 +95,7 @@ def train(
     return Result(config, training, outcome.state, stack(history.rows))
 
 
-@devices.single_precision()
+@devices.standard_numerics()
 def resume(
     run_dir: str | Path,
     *,
