@@ -6,7 +6,7 @@ import traceback
 
 import matd3_jax
 
-_IN_A_MESSAGE = re.compile(r"OS error (\d+)")
+_IN_A_MESSAGE = re.compile(r"os_error_code='(\d+)'")
 """How tensorstore, which writes checkpoints, passes an error of the system on."""
 
 
