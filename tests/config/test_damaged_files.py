@@ -46,7 +46,7 @@ DAMAGED = {
     "deep lists": "a: " + "[" * 5000 + "]" * 5000,
     "deep groups": "{a: " * 5000 + "1" + "}" * 5000,
     "a number of 5000 digits": WHOLE.replace("seeds: 4", f"seeds: {'9' * 5000}"),
-    "values that multiply": "a: &a [1, 1]\n" + "".join(f"{b}: &{b} [*{a}, *{a}]\n" for a, b in zip("abcdef", "bcdefg")),
+    "values that multiply": "a: &a [1, 1]\nb: &b [*a, *a]\nc: &c [*b, *b]\n",
     "a value in itself": "a: &a [*a]",
     "far too long": f"{WHOLE}# {'x' * 2_000_000}\n",
 }

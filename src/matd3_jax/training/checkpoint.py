@@ -84,14 +84,22 @@ def save(
     if processes.first:
         checksums = dict(sorted(pair for part in parts for pair in json.loads(part).items()))
         files.write_json(partial_ / "checksums.json", checksums)
-        shutil.rmtree(final, ignore_errors=True)
+        _remove(final)
         partial_.rename(final)
         files.sync_folder(folder)
         for old in steps(folder)[:-keep]:
-            shutil.rmtree(folder / str(old))
+            _remove(folder / str(old))
         for aside in folder.glob(f"*{ASIDE}"):
             shutil.rmtree(aside, ignore_errors=True)
     return final
+
+
+def _remove(path: Path) -> None:
+    """Remove a checkpoint, if it is there; of a link to one the link."""
+    if path.is_symlink():
+        path.unlink()
+    elif path.exists():
+        shutil.rmtree(path)
 
 
 def set_aside_after(folder: Path, step: int) -> None:
