@@ -180,7 +180,7 @@ class Plot:
 
 def _settings() -> str:
     """What train's help says of settings, from the files of settings."""
-    comments = (groups.FOLDER / "config.yaml").read_text().split("\n\n", 2)[2]
+    comments = (groups.FOLDER / "config.yaml").read_text(encoding="utf-8").split("\n\n", 2)[2]
     names = {"environments:": "env", "algorithms:": "algo", "recipes:": "recipe"}
     lines = [f"{title:<14}{', '.join(groups.known_names(group))}" for title, group in names.items()]
     wrapped = [textwrap.fill(line, WIDTH, subsequent_indent=" " * 14) for line in lines]

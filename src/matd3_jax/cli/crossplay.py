@@ -2,7 +2,6 @@
 
 import csv
 import dataclasses
-import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,7 +26,8 @@ from matd3_jax.runs import divergence
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runs.divergence import Divergence
 from matd3_jax.runs.paths import check_new_directory
-from matd3_jax.runtime import devices
+from matd3_jax.runtime import devices, files
+from matd3_jax.runtime.terminal import say, show
 from matd3_jax.training import checkpoint, memory
 from matd3_jax.training.session import TrainingSession
 
@@ -68,13 +68,11 @@ def main(argv: Sequence[str]) -> int:
     title = f"{entrants[0].settings.env['name']}, {who}, {options.episodes} {kind} episodes of each pair"
     for entrant in entrants:
         if entrant.diverged:
-            print(f"{entrant.name}: {divergence.of_seeds(entrant.settings.seeds, entrant.diverged)}, left out")
+            say(f"{entrant.name}: {divergence.of_seeds(entrant.settings.seeds, entrant.diverged)}, left out")
     _print(pairings, [entrant.name for entrant in entrants], title)
     _write(out, pairings, entrants, options)
     heat_map.draw(out / "heat_map.png", [entrant.name for entrant in entrants], pairings, title)
-    print(
-        f"every pair: {out / 'pairs.csv'}\nmeans and intervals: {out / 'means.csv'}\nheat map: {out / 'heat_map.png'}"
-    )
+    say(f"every pair: {out / 'pairs.csv'}\nmeans and intervals: {out / 'means.csv'}\nheat map: {out / 'heat_map.png'}")
     return 0
 
 
@@ -159,8 +157,8 @@ def _play(entrants: Sequence[Entrant], env: Environment, options: CrossPlay, mat
 
 def _print(pairings: Pairings, names: Sequence[str], title: str) -> None:
     """A table for each team's return, and the means over all runs."""
-    print(title)
-    console = Console(width=None if Console().is_terminal else 80 + sum(len(name) + 20 for name in names))
+    say(title)
+    width = 80 + sum(len(name) + 20 for name in names)
     for t, team in enumerate(TEAMS):
         table = Table(title=f"return of {team}")
         table.add_column("agents of")
@@ -179,8 +177,8 @@ def _print(pairings: Pairings, names: Sequence[str], title: str) -> None:
             cells = [_words(pairings.summary(None, j, own), t) for j in range(len(names))]
             total = [_words(pairings.summary(None, None, own), t) if own == column else "" for column in (True, False)]
             table.add_row("own pairs" if own else "cross pairs", *cells, *total)
-        console.print(table)
-    print("own: trained together (same run, same seed); cross: all others; ± 95 % interval over seeds")
+        show(table, width)
+    say("own: trained together (same run, same seed); cross: all others; ± 95 % interval over seeds")
 
 
 def _words(mean: Mean | None, team: int) -> str:
@@ -189,7 +187,7 @@ def _words(mean: Mean | None, team: int) -> str:
 
 def _write(out: Path, pairings: Pairings, entrants: Sequence[Entrant], options: CrossPlay) -> None:
     names = [entrant.name for entrant in entrants]
-    with (out / "pairs.csv").open("w", newline="") as file:
+    with (out / "pairs.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         heading = ("agents", "agents_seed", "adversaries", "adversaries_seed", "pair")
         writer.writerow((*heading, *(f"return_{team}" for team in TEAMS), "episodes"))
@@ -198,7 +196,7 @@ def _write(out: Path, pairings: Pairings, entrants: Sequence[Entrant], options: 
         ):
             who = [x for run, k in zip(runs, seeds, strict=True) for x in (names[run], entrants[run].settings.seed + k)]
             writer.writerow((*who, _kind(own), *(f"{value:.9g}" for value in returns), options.episodes))
-    with (out / "means.csv").open("w", newline="") as file:
+    with (out / "means.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         columns = [name for team in TEAMS for name in (f"return_{team}", f"return_{team}_half_width")]
         writer.writerow(("agents", "adversaries", "pair", "pairs", *columns))
@@ -218,9 +216,8 @@ def _write(out: Path, pairings: Pairings, entrants: Sequence[Entrant], options: 
     }
     chosen = {key: getattr(options, key) for key in ("pairing", "episodes", "deterministic", "seed")}
     settings = {**chosen, "runs": runs}
-    (out / "crossplay.json").write_text(
-        json.dumps({"env": dict(entrants[0].settings.env), **settings, **devices.versions()}, indent=1) + "\n"
-    )
+    environment = dict(entrants[0].settings.env)
+    files.write_json(out / "crossplay.json", {"env": environment, **settings, **devices.versions()})
 
 
 def _kind(own: bool) -> str:

@@ -4,7 +4,6 @@ import csv
 from collections.abc import Sequence
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from matd3_jax.cli import arguments
@@ -12,6 +11,7 @@ from matd3_jax.core.rollout import Evaluation
 from matd3_jax.runs import divergence
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import devices
+from matd3_jax.runtime.terminal import show
 from matd3_jax.stats.intervals import mean_interval
 from matd3_jax.stats.text import plus_minus
 from matd3_jax.training import checkpoint, memory
@@ -54,8 +54,8 @@ def main(argv: Sequence[str]) -> int:
                 for i, seed in enumerate(numbers)
             ]
         table.add_section()
-    Console(width=None if Console().is_terminal else 200).print(table)
-    with (run.path / "evaluation.csv").open("w", newline="") as file:
+    show(table, 200)
+    with (run.path / "evaluation.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(("policy", "quantity", "seed", "mean", "std", "episodes", "diverged"))
         writer.writerows(rows)

@@ -1,10 +1,10 @@
 """`matd3 COMMAND ...`: every command under one name."""
 
-import sys
 from collections.abc import Sequence
 
 from matd3_jax.cli import command
 from matd3_jax.errors import UserError, nearest
+from matd3_jax.runtime.terminal import say
 
 COMMANDS = {
     "train": "train, and leave a run directory",
@@ -23,7 +23,7 @@ HELP = "usage: matd3 COMMAND [key=value ...]\n\ncommands (matd3 COMMAND --help s
 def main(argv: Sequence[str]) -> int:
     """Run a command by its name; the exit code. Raises UserError for a name that is none."""
     if not argv or argv[0] in ("-h", "--help"):
-        print(HELP)
+        say(HELP)
         return 0 if argv else 2
     name, *rest = argv
     if name not in COMMANDS:
@@ -33,4 +33,4 @@ def main(argv: Sequence[str]) -> int:
 
 def script() -> None:
     """What the console script `matd3` calls."""
-    sys.exit(command.code(main, sys.argv[1:]))
+    command.run(main)

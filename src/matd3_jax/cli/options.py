@@ -189,7 +189,11 @@ def _read(name: str, texts: Sequence[str], hint: Any, meta: typing.Mapping[str, 
     kind = kinds[0]
     if typing.get_origin(kind) is tuple:
         member = typing.get_args(kind)[0]
-        value: Any = tuple(_convert(name, word, member, meta, texts[0]) for word in words(texts[0]))
+        try:
+            several = words(texts[0])
+        except UserError as error:
+            raise UserError(f"{name}: {error}") from error
+        value: Any = tuple(_convert(name, word, member, meta, texts[0]) for word in several)
     else:
         value = _convert(name, texts[0], kind, meta, texts[0])
     if meta["new_file"] and value is not None:

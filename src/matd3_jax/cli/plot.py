@@ -14,6 +14,7 @@ from matd3_jax.errors import UserError, nearest
 from matd3_jax.figures import learning_curves
 from matd3_jax.figures.learning_curves import Line, Panel
 from matd3_jax.runs import curves, directory, divergence
+from matd3_jax.runtime.terminal import say
 from matd3_jax.stats import bootstrap, intervals
 
 INTERVALS = {"mean": ("t", "bootstrap", "sd", "none"), "median": ("bootstrap", "none"), "iqm": ("bootstrap", "none")}
@@ -50,7 +51,7 @@ def main(argv: Sequence[str]) -> int:
     for panel, (name, columns) in zip(panels, found.items(), strict=True):
         for label, line, column, diverged in zip(labels, panel.lines, columns, lost, strict=True):
             _tell(f"{label}: {name}", line.estimate, column, diverged, options)
-    print(options.out)
+    say(str(options.out))
     return 0
 
 
@@ -114,13 +115,13 @@ def _tell(
     count = len(found.seeds)
     band = "" if np.isnan(low) else f" ({BANDS[str(options.interval)]}: {low:.4g} to {high:.4g})"
     of = f"{AVERAGES[options.average]} of {count} seeds" if count > 1 else "one seed"
-    print(f"{what} {value:.4g}{band}, {of}, at {options.x} {found.x[-1]:,.0f}")
+    say(f"{what} {value:.4g}{band}, {of}, at {options.x} {found.x[-1]:,.0f}")
     shortest, farthest = found.ends.min(), found.ends.max()
     if farthest - found.x[-1] > 2 * np.diff(found.x, prepend=0).max():
         early = ", ".join(f"{seed:.0f}" for seed in found.seeds[found.ends == shortest])
-        print(f"  drawn up to there because the values with seed {early} end; others go on to {farthest:,.0f}")
+        say(f"  drawn up to there because the values with seed {early} end; others go on to {farthest:,.0f}")
     if diverged:
-        print(f"  {divergence.which(diverged)}: values from there on are left out")
+        say(f"  {divergence.which(diverged)}: values from there on are left out")
 
 
 def _y_label(name: str, table: Mapping[str, np.ndarray]) -> str:

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from matd3_jax.cli import arguments
-from matd3_jax.config import Config
 from matd3_jax.errors import UserError
 from matd3_jax.evaluation import trajectory
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import devices
+from matd3_jax.runtime.terminal import say
 from matd3_jax.training import checkpoint, memory
 from matd3_jax.training.session import TrainingSession
 from matd3_jax.video import encode, frames
@@ -30,7 +30,7 @@ def main(argv: Sequence[str]) -> int:
         raise UserError(f"seed={seed}: the seeds of {run.path} are {settings.seed} to {last}")
     out = options.out or run.path / "episode.gif"
     encode.check(out, options.fps or 1)
-    training = _training(settings)
+    training = TrainingSession(settings)
     longest = training.env.episode_length
     steps = longest if options.max_steps is None else min(options.max_steps, longest)
     kept = memory.Part(steps * memory.playing_bytes(training.env, training.layout), "its env steps", "max_steps", steps)
@@ -57,17 +57,8 @@ def main(argv: Sequence[str]) -> int:
     shown = played.at(options.every or math.ceil(played.length / PICTURES))
     pictures = frames.compose(drawing, shown.states, shown.captions(), options.size)
     encode.write(out, pictures, options.fps or drawing.fps)
-    print(
+    say(
         f"{out}: {len(pictures)} frames of episode {options.episode} with seed {seed}, {played.length} env steps "
         f"({played.end}), {played.result}"
     )
     return 0
-
-
-def _training(settings: Config) -> TrainingSession:
-    try:
-        return TrainingSession(settings)
-    except RuntimeError as error:
-        if "MUJOCO_GL" in str(error):  # MuJoCo cannot even be imported with a value that it does not know
-            raise UserError(" ".join(str(error).split())) from error
-        raise

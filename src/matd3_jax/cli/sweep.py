@@ -15,6 +15,7 @@ from matd3_jax.figures import sweep as sweep_figure
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import devices, files, multihost, slurm
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
+from matd3_jax.runtime.terminal import say
 from matd3_jax.sweep import batching, launcher, ranking, search_space
 from matd3_jax.sweep.runner import Sweep
 from matd3_jax.sweep.search_space import SearchSpace
@@ -66,7 +67,7 @@ def start(given: SweepOptions, argv: Sequence[str], processes: Processes) -> int
         return code or _report_if_finished(sweep, None, facts)
     if not given.train:
         if processes.first:
-            print(f"train a batch with: {_resume_line(folder)} batch=K (0 to {len(sweep.batches) - 1})\n"
+            say(f"train a batch with: {_resume_line(folder)} batch=K (0 to {len(sweep.batches) - 1})\n"
                   f"then rank with: {_resume_line(folder)}")  # fmt: skip
         return 0
     return _train(sweep, None, facts)
@@ -82,9 +83,7 @@ def _plan(
     facts = {**facts, "runs": {name: [path.name for path in paths] for name, paths in runs.items()}}
     files.write_json(folder / "sweep.json", facts)
     seeds = sum(c.seeds for c in settings.values())
-    print(
-        f"sweep directory: {folder}\n{len(settings)} settings, {seeds} seeds, {len(sweep.batches)} batches", flush=True
-    )
+    say(f"sweep directory: {folder}\n{len(settings)} settings, {seeds} seeds, {len(sweep.batches)} batches")
 
 
 def check_metric(settings: Iterable[Config], metric: str) -> None:
@@ -110,6 +109,7 @@ def read(overrides: Sequence[str], samples: int | None, seed: int) -> tuple[list
         except UserError as error:
             swept = ", ".join(f"{key}={value}" for key, value in values.items())
             raise UserError(f"{error} (with {swept})" if values else str(error)) from error
+    batching.check_seeds(settings)
     return chosen, settings
 
 
@@ -129,7 +129,7 @@ def resume(folder: Path, given: SweepOptions, argv: Sequence[str], processes: Pr
 def open_sweep(folder: Path, processes: Processes = SINGLE_PROCESS) -> tuple[Sweep, dict[str, Any]]:
     """A sweep and its facts (command, metric, settings). Raises UserError if there is none."""
     try:
-        return Sweep(folder, processes), json.loads((folder / "sweep.json").read_text())
+        return Sweep(folder, processes), json.loads((folder / "sweep.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         raise UserError(f"{folder} is no sweep directory: it has no sweep.json") from None
 
@@ -139,7 +139,7 @@ def _train(sweep: Sweep, batch: int | None, facts: Mapping[str, Any]) -> int:
     if not sweep.processes.first:
         return sweep.processes.broadcast()
     if code:
-        print(f"stopped; resume with: {_resume_line(sweep.folder)}")
+        say(f"stopped; resume with: {_resume_line(sweep.folder)}")
     return sweep.processes.broadcast(code or _report_if_finished(sweep, batch, facts))
 
 
@@ -147,7 +147,7 @@ def _report_if_finished(sweep: Sweep, batch: int | None, facts: Mapping[str, Any
     left = [k for k in range(len(sweep.batches)) if not sweep.finished(k)]
     if not left:
         return command.DIVERGED if report(sweep, facts) else 0
-    print(f"not finished yet: batch {', '.join(map(str, left))}; resume with: {_resume_line(sweep.folder)}")
+    say(f"not finished yet: batch {', '.join(map(str, left))}; resume with: {_resume_line(sweep.folder)}")
     return 0 if batch is not None and batch not in left else 1
 
 
@@ -161,6 +161,6 @@ def report(sweep: Sweep, facts: Mapping[str, Any]) -> bool:
     ranking.show(rows, f"{sweep.folder}: {facts['metric']}")
     ranking.write(sweep.folder, rows)
     sweep_figure.draw(sweep.folder / "sweep.png", sweep.runs, facts["runs"], rows, str(facts["metric"]))
-    print(f"all settings: {sweep.folder / 'table.csv'}, all seeds: {sweep.folder / 'seeds.csv'}\n"
+    say(f"all settings: {sweep.folder / 'table.csv'}, all seeds: {sweep.folder / 'seeds.csv'}\n"
           f"figure: {sweep.folder / 'sweep.png'}\nruns: {sweep.runs}")  # fmt: skip
     return all(row.diverged.all() for row in rows)

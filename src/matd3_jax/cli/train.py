@@ -10,26 +10,21 @@ from matd3_jax.config import Config
 from matd3_jax.errors import UserError
 from matd3_jax.runtime import devices, multihost, slurm
 from matd3_jax.runtime.terminal import say
-from matd3_jax.training.recording import Recorder
+from matd3_jax.training.recording import Recorded, Recorder
 
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit code."""
     given = arguments.TRAIN.parse(argv)
     if given.cfg:
-        print(config.text(config.load(given.settings, arguments.TRAIN.keys)), end="")
+        say(config.text(config.load(given.settings, arguments.TRAIN.keys)), end="")
         return 0
     devices.prepare()
     with multihost.start(given.processes()) as processes:
         processes.check_same(" ".join(text for text in argv if options.key(text) not in slurm.KEYS), "settings")
         recorder = Recorder(processes, heed_signals=True, say=say)
-        if given.resume is not None:
-            recorded = recorder.resume(given.resume, given.checkpoint, _total_steps(given.settings))
-        elif given.checkpoint is not None:
-            raise UserError("checkpoint= goes with resume=RUN_DIR")
-        else:
-            settings = config.load(given.settings, arguments.TRAIN.keys)
-            recorded = recorder.start(settings, Path(settings.out) / (settings.name or _name(settings)))
+        with command.resumable("matd3_jax.train", lambda: recorder.path):
+            recorded = _train(recorder, given)
         path, outcome = recorded.directory.path, recorded.outcome
         everywhere = processes.broadcast(len(outcome.diverged) == recorded.training.share.total)
         if outcome.finished:
@@ -38,10 +33,20 @@ def main(argv: Sequence[str]) -> int:
         step = recorded.training.step(outcome.state)
         line = command.line("matd3_jax.train", resume=path)
         if outcome.stopped is None:
-            recorder.say(f"stopped at env step {step:,} since a seed diverged; go on with: {line}")
+            recorder.say(f"stopped at env step {step:,} since a seed diverged; resume with: {line}")
             return command.DIVERGED
         recorder.say(f"stopped by {outcome.stopped.name} at env step {step:,}; resume with: {line}")
         return 128 + outcome.stopped
+
+
+def _train(recorder: Recorder, given: arguments.Train) -> Recorded:
+    if given.resume is not None:
+        return recorder.resume(given.resume, given.checkpoint, _total_steps(given.settings))
+    if given.checkpoint is not None:
+        raise UserError("checkpoint= goes with resume=RUN_DIR")
+    settings = config.load(given.settings, arguments.TRAIN.keys)
+    name = settings.name or _name(settings)
+    return recorder.start(settings, Path(settings.out) / name, or_another=not settings.name)
 
 
 def _total_steps(overrides: Sequence[str]) -> int | None:
@@ -58,10 +63,6 @@ def _total_steps(overrides: Sequence[str]) -> int | None:
 
 
 def _name(settings: Config) -> str:
-    """A name for a run without one: what it trains, and when; another one where a run has it already."""
+    """A name for a run without one: what it trains, and when."""
     against = f"-vs-{settings.adversary.name}" if settings.adversary else ""
-    name = f"{settings.env['name']}-{settings.algo.name}{against}-{time.strftime('%Y%m%d-%H%M%S')}"
-    found, number = name, 2
-    while (Path(settings.out) / found).exists():
-        found, number = f"{name}-{number}", number + 1
-    return found
+    return f"{settings.env['name']}-{settings.algo.name}{against}-{time.strftime('%Y%m%d-%H%M%S')}"

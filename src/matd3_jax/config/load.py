@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra import compose, initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType, ValueType
@@ -19,6 +20,11 @@ from matd3_jax.config.validate import check
 from matd3_jax.errors import OptionError, UserError, nearest
 from matd3_jax.groups import GROUPS, known_names
 from matd3_jax.runtime import files
+
+DEEPEST, LARGEST_FILE = 20, 10**6
+"""Groups within each other, and characters, of a file of settings that is read."""
+
+_MALFORMED = (yaml.YAMLError, OmegaConfBaseException)
 
 ROBOT_RECIPE = "fast"
 """What robots train by unless a recipe is given, on every machine."""
@@ -42,7 +48,7 @@ def load(overrides: Sequence[str] = (), known: Sequence[str] = ()) -> Config:
         valid = known_names(group)
         for value in (o.value() for o in parsed if o.key_or_group == group):
             if value not in valid:
-                raise UserError(f"no {noun} is called {value!r}; {nearest(value, valid)}")
+                raise UserError(f"{group}: no {noun} is called {value!r}; {nearest(value, valid)}")
     # Files first: Hydra wants them chosen before their values are changed.
     chosen = [o for o in parsed if o.key_or_group in GROUPS]
     values = [o for o in parsed if o.key_or_group not in GROUPS and not _is_text(o)]
@@ -67,7 +73,7 @@ def load(overrides: Sequence[str] = (), known: Sequence[str] = ()) -> Config:
         for override in values:
             if override.is_add() and not override.is_force_add():
                 raise UserError(f"cannot add {_line(override)!r}: the key is there, write it without the +")
-            OmegaConf.update(tree, override.key_or_group, override.value())
+            _update(tree, override)
         resolved = OmegaConf.to_container(tree, resolve=True, throw_on_missing=True)
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(_one_line(error)) from error
@@ -92,7 +98,7 @@ def parse(overrides: Sequence[str], sweep: bool = False) -> list[Override]:
             continue
         try:
             override = _parser().parse_override(text)
-        except (HydraException, OverrideParseException) as error:
+        except (HydraException, OverrideParseException, RecursionError, ValueError) as error:
             example = "key=value, for instance algo.lr=0.003" + (" or algo.lr=0.01,0.003" if sweep else "")
             raise UserError(f"cannot read {text!r}: write {example}") from error
         if override.is_delete() or override.is_sweep_override() and not sweep:
@@ -116,17 +122,34 @@ def _files(lines: tuple[str, ...]) -> DictConfig:
 def read(path: Path) -> Config:
     """The configuration that `write` left. Raises UserError if it cannot be read."""
     try:
-        found = OmegaConf.to_container(OmegaConf.load(path))
-        assert isinstance(found, dict)
+        written = path.read_text(encoding="utf-8")
+        _check_plain(written)
+        found = OmegaConf.to_container(OmegaConf.create(written)) if written.strip() else None
+        if not isinstance(found, dict):
+            raise UserError("it has no settings")
         values = _with_defaults(renamed(found), ADDED_LATER)
-        if "physics" in values["env"]:
+        if "physics" in _environment(values):
             from matd3_jax.envs.robots.engines.engine import RENAMED
 
             physics = values["env"]["physics"]
             values["env"] = {**values["env"], "physics": RENAMED.get(physics, physics)}
         return from_dict(values)
-    except (OSError, AssertionError, ValueError, OmegaConfBaseException) as error:
+    except (OSError, ValueError, TypeError, AttributeError, AssertionError, *_MALFORMED) as error:
         raise UserError(f"cannot read the configuration {path}: {_one_line(error)}") from error
+
+
+def _check_plain(text: str) -> None:
+    """Raise UserError where YAML is not of the kind that `write` leaves: values that refer to each other may stand for
+    any number, and deep ones for more calls than there may be."""
+    depth = 0
+    if len(text) > LARGEST_FILE:
+        raise UserError(f"it has more than {LARGEST_FILE:,} characters")
+    for event in yaml.parse(text):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if isinstance(event, yaml.AliasEvent):
+            raise UserError(f"*{event.anchor} refers to another value, which settings do not")
+        if depth > DEEPEST:
+            raise UserError(f"it has more than {DEEPEST} groups inside each other")
 
 
 def renamed(values: Mapping[Any, Any]) -> dict[Any, Any]:
@@ -149,19 +172,37 @@ def write(config: Config, path: Path) -> None:
 def from_dict(values: Mapping[str, Any]) -> Config:
     """A checked configuration from plain values. Raises UserError."""
     rest = dict(values)
-    env = rest.pop("env")
-    algo = typed(AlgoConfig, {k: v for k, v in rest.pop("algo").items() if k != "lr"}, "algo.")
-    adversary = rest.pop("adversary", None)
-    if adversary is not None:
-        adversary = typed(AlgoConfig, {k: v for k, v in adversary.items() if k != "lr"}, "adversary.")
-    diagnostics = rest.pop("diagnostics", None)
-    if not isinstance(diagnostics, Mapping):
-        raise UserError(f"diagnostics={diagnostics!r}: must be a group of keys, for instance diagnostics.q_bias=true")
-    diagnostics = typed(DiagnosticsConfig, diagnostics, "diagnostics.")
+    env = _environment(rest)
+    algo = typed(AlgoConfig, _algorithm(rest, "algo"), "algo.")
+    adversary = None
+    if rest.get("adversary") is not None:
+        adversary = typed(AlgoConfig, _algorithm(rest, "adversary"), "adversary.")
+    diagnostics = typed(DiagnosticsConfig, _group(rest, "diagnostics", "diagnostics.q_bias=true"), "diagnostics.")
     groups = {"env": env, "algo": algo, "adversary": adversary, "diagnostics": diagnostics}
     config = typed(Config, {**rest, **groups}, "")
     check(config)
     return config
+
+
+def _group(values: Mapping[str, Any], key: str, example: str) -> Mapping[str, Any]:
+    """A group of settings. Raises UserError where it is missing, or no group."""
+    if key not in values:
+        raise UserError(f"the key {key!r} is missing")
+    found = values[key]
+    if not isinstance(found, Mapping):
+        raise UserError(f"{key}={found!r}: must be a group of keys, for instance {example}")
+    return found
+
+
+def _algorithm(values: Mapping[str, Any], key: str) -> dict[str, Any]:
+    return {name: value for name, value in _group(values, key, f"{key}.gamma=0.95").items() if name != "lr"}
+
+
+def _environment(values: Mapping[str, Any]) -> Mapping[str, Any]:
+    env = _group(values, "env", "env.name=simple_spread")
+    if not isinstance(env.get("name"), str):
+        raise UserError(f"env.name={env.get('name')!r}: must be the name of an environment")
+    return env
 
 
 def _with_engine(env: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -193,6 +234,8 @@ def _check_keys(tree: DictConfig, values: Sequence[Override], known: Sequence[st
         for depth, name in enumerate(path):
             if not isinstance(node, DictConfig) or name not in node:
                 prefix = ".".join(path[:depth])
+                if depth and not isinstance(node, DictConfig):
+                    raise UserError(f"there is no key {override.key_or_group!r}: {prefix} has a value, no keys")
                 keys = [str(key) for key in node] if isinstance(node, DictConfig) else []
                 keys += known if not depth else []
                 # A key typed without its group, or in the wrong one, is a common slip: look there, too.
@@ -206,6 +249,13 @@ def _check_keys(tree: DictConfig, values: Sequence[Override], known: Sequence[st
                     f"there is no key {override.key_or_group!r}{f' (in {prefix})' if prefix else ''}; {hint}"
                 )
             node = node[name] if OmegaConf.is_config(node) and not OmegaConf.is_missing(node, name) else node
+
+
+def _update(tree: DictConfig, override: Override) -> None:
+    """Give a key its value; keys of a group that the value lacks stay as they are."""
+    key, value = override.key_or_group, override.value()
+    both = isinstance(value, Mapping) and isinstance(OmegaConf.select(tree, key), DictConfig)
+    OmegaConf.update(tree, key, value, merge=both)
 
 
 def _is_text(override: Override) -> bool:
@@ -232,4 +282,8 @@ def _renamed(override: Override) -> Override:
 
 
 def _one_line(error: BaseException) -> str:
+    """What an error says, without what OmegaConf adds on further lines but for the key."""
+    if isinstance(error, OmegaConfBaseException):
+        key = f"{error.full_key}: " if error.full_key else ""
+        return key + str(error).split("\n")[0]
     return " ".join(str(error).split())

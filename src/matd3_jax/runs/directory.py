@@ -1,5 +1,6 @@
 """The run directory: settings, versions, the metrics table, checkpoints and pictures of one run."""
 
+import itertools
 import json
 import os
 import shlex
@@ -36,23 +37,32 @@ class RunDirectory:
         self.tensorboard = path / "tensorboard"
 
     @staticmethod
-    def check_new(path: Path) -> None:
-        """Raise UserError where no directory for a run, or a sweep, can be made anew. Makes nothing."""
+    def check_new(path: Path, or_another: bool = False) -> None:
+        """Raise UserError where no directory for a run, or a sweep, can be made anew. Makes nothing.
+
+        or_another: another one (see `create`) will do where this is there.
+        """
         check_directory(path, "directory")
         if "\\" in str(path.absolute()) and os.sep == "/":  # which Orbax would take for a slash
             raise UserError(f"{str(path.absolute())!r}: checkpoints cannot be kept where a path has a backslash")
-        if path.exists():
+        if path.exists() and not or_another:
             raise UserError(_there(path))
 
     @classmethod
-    def create(cls, path: Path, config: Config, machine: Mapping[str, Any]) -> "RunDirectory":
-        """Make the directory. Raises UserError if it is there already or cannot be made."""
-        try:
-            path.mkdir(parents=True)
-        except FileExistsError:
-            raise UserError(_there(path)) from None
-        except OSError as error:
-            raise UserError(f"cannot make the run directory {path}: {error.strerror}") from error
+    def create(cls, path: Path, config: Config, machine: Mapping[str, Any], or_another: bool = False) -> "RunDirectory":
+        """Make the directory, or with `or_another` the first of PATH, PATH-2, PATH-3, ... that is not there yet, even
+        while others do the same. Raises UserError if it is there already or cannot be made."""
+        for tried in (path if k == 1 else path.with_name(f"{path.name}-{k}") for k in itertools.count(1)):
+            try:
+                tried.mkdir(parents=True)
+            except FileExistsError:
+                if not or_another:
+                    raise UserError(_there(path)) from None
+            except OSError as error:
+                raise UserError(f"cannot make the run directory {path}: {error.strerror}") from error
+            else:
+                path = tried
+                break
         run = cls(path)
         configuration.write(config, path / "config.yaml")
         files.write_json(path / "machine.json", machine)

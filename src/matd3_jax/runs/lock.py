@@ -49,11 +49,11 @@ def _by_system(path: Path) -> Iterator[None]:
 def _by_owner(path: Path) -> Iterator[None]:
     for _ in range(2):
         try:
-            with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "w") as file:
+            with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "w", encoding="utf-8") as file:
                 file.write(_owner())
             break
         except FileExistsError:
-            written = path.read_text(errors="replace")
+            written = path.read_text(encoding="utf-8", errors="replace")
             if not _gone(written):
                 raise _taken(path, written) from None
             path.unlink(missing_ok=True)
@@ -68,7 +68,12 @@ def _by_owner(path: Path) -> Iterator[None]:
 def _opened(path: Path) -> IO[str]:
     if path.is_symlink():
         raise UserError(f"{path} is a link: nothing is written through it")
-    return os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666), "r+")
+    return os.fdopen(
+        os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666),
+        "r+",
+        encoding="utf-8",
+        errors="replace",
+    )
 
 
 def _owner() -> str:

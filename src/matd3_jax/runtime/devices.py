@@ -1,11 +1,14 @@
 """Set the machine up before JAX starts, and say what it is."""
 
+import contextlib
 import importlib.metadata
 import os
 import platform
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
+import jaxlib
 import psutil
 
 PACKAGES = (
@@ -21,13 +24,18 @@ def prepare() -> None:
     effect, once JAX has computed something: a library user's own devices stand.
     """
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ and getattr(jax.config, "jax_compilation_cache_dir", None) is None:
-        home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
-        jax.config.update("jax_compilation_cache_dir", str(home / "matd3_jax"))
+        cache = cache_folder()
+        if cache is not None:
+            jax.config.update("jax_compilation_cache_dir", str(cache))
     flags = os.environ.get("XLA_FLAGS", "")
-    if jax.__version__.startswith(("0.10.", "0.11.")) and "ynn_fusion_type" not in flags:
+    if jaxlib.__version__.startswith(("0.10.", "0.11.")) and "ynn_fusion_type" not in flags:
         # Whole networks fused into one library call run at half the speed of single products in 0.10, at nine tenths in
         # 0.11. Other versions may not know the flag, and end the process over it.
         os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_experimental_ynn_fusion_type=LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT"
+    if jaxlib.__version__.startswith("0.11.") and "JAX_USE_SHARDY_PARTITIONER" not in os.environ:
+        # Shardy's ManualComputationUnusedInputsPattern of 0.11.2 ends the process (a segmentation fault) at robots that
+        # MJX steps on several devices; the older partitioner compiles them.
+        jax.config.update("jax_use_shardy_partitioner", False)
     if "JAX_NUM_CPU_DEVICES" in os.environ or "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
         return
     try:
@@ -36,6 +44,24 @@ def prepare() -> None:
         )
     except RuntimeError:
         pass
+
+
+def cache_folder() -> Path | None:
+    """Where compiled programs are kept; None where the user's cache cannot be written to, or there is no home."""
+    try:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "matd3_jax"
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # the latter of a user without a home
+        return None
+    return folder if folder.is_absolute() and os.access(folder, os.W_OK | os.X_OK) else None
+
+
+@contextlib.contextmanager
+def standard_numerics() -> Iterator[None]:
+    """Compute in float32 and int32 within, and by NumPy's rules of promotion, whatever JAX_ENABLE_X64,
+    JAX_NUMPY_DTYPE_PROMOTION and JAX_NUMPY_RANK_PROMOTION say: the numbers are the same."""
+    with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
 
 
 def accelerated() -> bool:
@@ -69,7 +95,7 @@ def description() -> dict[str, object]:
 def processor() -> str:
     """The CPU's model name."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         return platform.processor() or platform.machine()
@@ -91,7 +117,7 @@ def free_memory(sharing: int = 1) -> int:
     free = psutil.virtual_memory().available // sharing
     group = Path("/sys/fs/cgroup")
     try:
-        limit = int((group / "memory.max").read_text())
-        return min(free, (limit - int((group / "memory.current").read_text())) // sharing)
+        limit = int((group / "memory.max").read_text(encoding="utf-8"))
+        return min(free, (limit - int((group / "memory.current").read_text(encoding="utf-8"))) // sharing)
     except (OSError, ValueError):
         return free

@@ -21,6 +21,7 @@ import numpy as np
 from matd3_jax.errors import UserError
 from matd3_jax.private import coordination_service
 from matd3_jax.runtime import devices, slurm
+from matd3_jax.runtime.terminal import say
 
 
 class Share(NamedTuple):
@@ -131,7 +132,7 @@ class Processes:
 
     def check_same(self, text: str, what: str) -> None:
         """Raise UserError unless all give the same text. what: names it in the message."""
-        texts = self.gather_messages(text.encode())
+        texts = self.gather_messages(text.encode(errors="surrogateescape"))
         for index, other in enumerate(texts):
             if other != texts[0]:
                 raise UserError(f"process {index} was given {what} other than process 0: {other.decode()}")
@@ -215,7 +216,7 @@ def start(given: Mapping[str, str]) -> Processes:
     address, size, index, _ = found
     # It would catch SIGTERM, which the commands do themselves.
     jax.config.update("jax_enable_preemption_service", False)
-    print(f"process {index}: waiting for all {size} processes at {address}", flush=True)
+    say(f"process {index}: waiting for all {size} processes at {address}")
     slurm.look_for(address, index == 0)
     # What `jax.distributed.initialize` does, but for informing JAX's backends, which would join all processes' devices:
     # Orbax would then write arrays in process 0 only, and the compilation cache be written by that one alone.

@@ -53,6 +53,20 @@ def missing(config: Config, existing: Mapping[str, Config]) -> tuple[list[str], 
     return names, [seed for seed in wanted if seed not in there]
 
 
+def check_seeds(settings: Mapping[str, Config]) -> None:
+    """Raise UserError where two settings, given by name, differ in nothing but their seeds and share some."""
+    owners: dict[tuple[str, int], str] = {}
+    for name, config in settings.items():
+        same = json.dumps(bare(config).to_dict())
+        for seed in range(config.seed, config.seed + config.seeds):
+            owner = owners.setdefault((same, seed), name)
+            if owner != name:
+                raise UserError(
+                    f"{owner} and {name} are the same settings and both have seed {seed}: sweep another key, or give "
+                    "values of seed= that are at least seeds= apart"
+                )
+
+
 def consecutive(seeds: Sequence[int], longest: int) -> list[tuple[int, int]]:
     """(first seed, number of seeds) of runs of consecutive seeds, of nearly equal length and none above `longest`."""
     found: list[tuple[int, int]] = []

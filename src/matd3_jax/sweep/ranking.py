@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from matd3_jax.errors import UserError, nearest
 from matd3_jax.runs import divergence
 from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.runtime import terminal
 from matd3_jax.stats.intervals import mean_interval
 from matd3_jax.stats.text import plus_minus
 
@@ -84,26 +84,26 @@ def show(rows: Sequence[Ranked], title: str, most: int = 30) -> None:
         cells = [plus_minus(*row.interval(which)) for which in ("final", "area")]
         diverged = str(row.diverged.sum()) if row.diverged.any() else "-"
         table.add_row(str(k + 1), *row.values.values(), str(len(row.seeds)), diverged, *cells)
-    Console(width=None if Console().is_terminal else 200).print(table)
+    terminal.show(table, 200)
     if len(rows) > most:
-        print(f"and {len(rows) - most} more settings")
+        terminal.say(f"and {len(rows) - most} more settings")
     lost = [f"{row.name} seed {seed}" for row in rows for seed in row.seeds[row.diverged]]
     if lost:
         more = f", and {len(lost) - 10} more" if len(lost) > 10 else ""
-        print(f"diverged, left out of all means: {', '.join(lost[:10])}{more}")
+        terminal.say(f"diverged, left out of all means: {', '.join(lost[:10])}{more}")
 
 
 def write(folder: Path, rows: Sequence[Ranked]) -> None:
     """Leave table.csv (a row each setting) and seeds.csv (a row each setting and seed)."""
     keys = list(rows[0].values)
-    with (folder / "table.csv").open("w", newline="") as file:
+    with (folder / "table.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         intervals = ("final_mean", "final_interval", "area_mean", "area_interval")
         writer.writerow(("rank", "setting", *keys, "seeds", "diverged", *intervals))
         for k, row in enumerate(rows):
             numbers = [f"{x:.6g}" for which in ("final", "area") for x in row.interval(which)]
             writer.writerow((k + 1, row.name, *row.values.values(), len(row.seeds), row.diverged.sum(), *numbers))
-    with (folder / "seeds.csv").open("w", newline="") as file:
+    with (folder / "seeds.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(("rank", "setting", *keys, "seed", "diverged", "final", "area"))
         for k, row in enumerate(rows):

@@ -51,7 +51,7 @@ class Sweep:
     @property
     def batches(self) -> list[list[str]]:
         """Names of the runs in each batch."""
-        return json.loads(self._plan.read_text()) if self._plan.exists() else []
+        return json.loads(self._plan.read_text(encoding="utf-8")) if self._plan.exists() else []
 
     def add(self, settings: Mapping[str, Config], budget: int | None = None) -> dict[str, list[Path]]:
         """Plan what is missing of `settings` (by name): the directories of each setting's runs, those already there
@@ -117,11 +117,11 @@ class Sweep:
             return
         folder = self.folder_of(batch)
         folder.mkdir(parents=True, exist_ok=True)
-        with (folder / "lock").open("w") as lock:
+        with (folder / "lock").open("w", encoding="utf-8") as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
-                print(f"batch {batch}: another process trains it, skipped", flush=True)
+                say(f"batch {batch}: another process trains it, skipped")
                 yield False
                 return
             yield True
@@ -190,7 +190,7 @@ class Batch:
             known = divergence.of_run(run, done)
             self.watch.diverged |= {own.start + seed - config.seed: found for seed, found in known.items()}
         if first:
-            print(f"resuming from the checkpoint of env step {done:,}", flush=True)
+            say(f"resuming from the checkpoint of env step {done:,}")
         updates = self.training.trainer.updates(int(state.rollouts))
         return state, {"step": np.array([done]), "updates": np.array([updates])}
 
@@ -215,10 +215,10 @@ class Batch:
         several = f" in each of {size} processes" if size > 1 else ""
         names = [str(member.name) for member in self.members]
         shown = ", ".join(names if len(names) <= 4 else [*names[:2], "...", names[-1]])
-        print(f"batch {self.number} ({self.number + 1} of {len(self.sweep.batches)}): {len(names)} runs, {seeds} seeds "
+        say(f"batch {self.number} ({self.number + 1} of {len(self.sweep.batches)}): {len(names)} runs, {seeds} seeds "
               f"in all, on {mesh.size} x {mesh.devices.flat[0].device_kind}{several}: {shown}")  # fmt: skip
-        print(f"{config.env['name']}, {training.total_steps:,} env steps each; {training.memory}; "
-              f"{needed(training.trainer, len(training.seeds)) / 1e9:.2f} GB in all", flush=True)  # fmt: skip
+        say(f"{config.env['name']}, {training.total_steps:,} env steps each; {training.memory}; "
+              f"{needed(training.trainer, len(training.seeds)) / 1e9:.2f} GB in all")  # fmt: skip
 
 
 class Stopped(Exception):

@@ -84,14 +84,22 @@ def save(
     if processes.first:
         checksums = dict(sorted(pair for part in parts for pair in json.loads(part).items()))
         files.write_json(partial_ / "checksums.json", checksums)
-        shutil.rmtree(final, ignore_errors=True)
+        _remove(final)
         partial_.rename(final)
         files.sync_folder(folder)
         for old in steps(folder)[:-keep]:
-            shutil.rmtree(folder / str(old))
+            _remove(folder / str(old))
         for aside in folder.glob(f"*{ASIDE}"):
             shutil.rmtree(aside, ignore_errors=True)
     return final
+
+
+def _remove(path: Path) -> None:
+    """Remove a checkpoint, if it is there; of a link to one the link."""
+    if path.is_symlink():
+        path.unlink()
+    elif path.exists():
+        shutil.rmtree(path)
 
 
 def set_aside_after(folder: Path, step: int) -> None:
@@ -137,7 +145,7 @@ def verify(folder: Path, step: int | None = None) -> Path:
         raise UserError(f"{folder} holds no checkpoint of step {step}; there: {', '.join(map(str, found))}")
     path = folder.resolve() / str(step)
     try:
-        wanted = json.loads((path / "checksums.json").read_text())
+        wanted = json.loads((path / "checksums.json").read_text(encoding="utf-8"))
         damaged = next((name for name, digest in wanted.items() if _digest(path / name) != digest), None)
     except FileNotFoundError as error:
         damaged = f"{Path(str(error.filename)).relative_to(path)} is missing"

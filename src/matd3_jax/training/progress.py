@@ -1,14 +1,16 @@
 """What a run shows while it goes: a bar on a terminal, a line every now and then elsewhere."""
 
+import contextlib
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from matd3_jax.runs.divergence import Divergence, of_seeds
+from matd3_jax.runtime.terminal import say
 from matd3_jax.stats.text import plus_minus
 from matd3_jax.training.clock import compiling
 from matd3_jax.training.session import Row, TrainingSession
@@ -51,7 +53,8 @@ class ProgressBar:
             columns = TextColumn("{task.percentage:>3.0f}%"), BarColumn(20), TextColumn("{task.description}")
             self.bar = Progress(*columns, console=self.console, refresh_per_second=4)
             self.task = self.bar.add_task("compiling", total=self.total, completed=self.step)
-            self.bar.start()
+            with _safely():
+                self.bar.start()
 
     def log(self, row: Row) -> None:
         """Show one more interval."""
@@ -59,9 +62,10 @@ class ProgressBar:
         self._note(row)
         text = self.text()
         if self.bar is not None:
-            self.bar.update(self.task, completed=self.step, description=text)
+            with _safely():
+                self.bar.update(self.task, completed=self.step, description=text)
         elif self.now - self.printed >= SECONDS_BETWEEN_LINES or self.step >= self.total:
-            print(f"{100 * self.step / self.total:3.0f}% {text}", flush=True)
+            say(f"{100 * self.step / self.total:3.0f}% {text}")
             self.printed = self.now
 
     def text(self) -> str:
@@ -90,7 +94,8 @@ class ProgressBar:
 
     def close(self) -> None:
         if self.bar is not None:
-            self.bar.stop()
+            with _safely():
+                self.bar.stop()
 
     # ---- time, since the bar began -----------------------------------------------------------------------------------
 
@@ -178,6 +183,13 @@ class ProgressBar:
             return "nan"
         fewer = f", {len(ended)} of {len(sound)} seeds" if len(ended) < len(sound) else ""
         return plus_minus(ended.mean(), ended.std(ddof=1) if len(ended) > 1 else None, ".1f", ".1f") + fewer
+
+
+@contextlib.contextmanager
+def _safely() -> Iterator[None]:
+    """Continue where the terminal is gone or lacks the letters: showing progress ends no run."""
+    with contextlib.suppress(OSError, ValueError):
+        yield
 
 
 def _duration(seconds: float) -> str:

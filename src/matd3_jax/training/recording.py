@@ -59,21 +59,27 @@ class Recorder:
         self.heed_signals = heed_signals
         self.say: Say = say if say is not None and processes.first else lambda line: None
         self.shows_progress = say is not None
+        self.path: Path | None = None
+        """Of the last run's directory, once it is there."""
 
-    def start(self, settings: Config, path: Path, env: Environment | None = None) -> Recorded:
+    def start(self, settings: Config, path: Path, env: Environment | None = None, or_another: bool = False) -> Recorded:
         """Train a fresh run in the directory `path`, which is made.
+
+        Args:
+            or_another: where it is there already take the first of PATH-2, PATH-3, ... that is not.
 
         Raises UserError where the run is impossible, before anything is written.
         """
         training = self._checked(settings, env)
         if self.processes.first:
-            RunDirectory.check_new(path)
+            RunDirectory.check_new(path, or_another)
         self.processes.barrier()  # nothing is written before all processes have found that they can train
         stop = self._stop()
         machine = {"versions": devices.versions(), **self.processes.description()}
         if self.processes.first:
-            RunDirectory.create(path, settings, machine)
+            path = RunDirectory.create(path, settings, machine, or_another).path
         directory = RunDirectory(self.processes.same_directory(path))
+        self.path = directory.path
         with self._held(directory):
             return self._from_the_start(training, directory, stop)
 
@@ -91,6 +97,7 @@ class Recorder:
         Raises UserError where there is no run, it has come to its end, or the checkpoint is damaged.
         """
         directory, settings = RunDirectory.open(path)
+        self.path = path
         if total_steps is not None:
             settings = config.from_dict({**settings.to_dict(), "total_steps": total_steps})
         with self._held(directory):

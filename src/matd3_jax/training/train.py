@@ -37,11 +37,13 @@ class Result:
     diverged: dict[int, int] = dataclasses.field(default_factory=dict)
     """Seeds whose losses, values, returns or networks were not finite, with the env step at which they first were."""
 
+    @devices.standard_numerics()
     def evaluate(self, episodes: int = 100, deterministic: bool = True, seed: int = 0) -> np.ndarray:
         """Undiscounted returns [seeds, episodes, agents] of whole episodes (see `TrainingSession.evaluate`)."""
         return self.training.evaluate(self.state, episodes, deterministic, seed).episode_return
 
 
+@devices.standard_numerics()
 def train(
     *overrides: str,
     env: str | Environment = "simple_spread",
@@ -99,6 +101,7 @@ def train(
     return Result(config, training, outcome.state, stack(history.rows), diverged=_diverged(config, outcome))
 
 
+@devices.standard_numerics()
 def resume(
     run_dir: str | Path,
     *,

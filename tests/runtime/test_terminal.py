@@ -1,0 +1,53 @@
+"""Printing never ends a program, whatever its terminal is."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+SAY = "from matd3_jax.runtime.terminal import complain, leave, say, show; import sys\n"
+TABLE = "from rich.table import Table; t = Table(title='\\xb1 95 %'); t.add_column('a'); t.add_row('\\xe9')\n"
+
+
+def python(code: str, **how) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, "-c", SAY + TABLE + code], capture_output=True, timeout=60, **how)
+
+
+def test_an_ascii_terminal():
+    ascii_only = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    done = python("say('3 \\xb1 1'); show(t); complain('\\xe9'); print('end')", env=ascii_only)
+    assert done.returncode == 0 and done.stdout.startswith(b"3 \\xb1 1\n"), done
+    assert done.stdout.isascii() and b"\\u" not in done.stdout  # the table's lines, too
+    assert b"\\xb1 95" in done.stdout and done.stdout.endswith(b"end\n")
+
+
+@pytest.mark.parametrize("closed", ["1", "2"])
+def test_a_closed_stream(closed):
+    code = f"import os; os.close({closed}); say('a'); show(t); complain('b'); leave(); sys.exit(0)"
+    assert python(code).returncode == 0
+
+
+def test_nobody_reads():
+    reader, writer = os.pipe()
+    os.close(reader)
+    code = SAY + TABLE + "for _ in range(9): say('a' * 10**5); show(t)\n"
+    done = subprocess.run([sys.executable, "-c", code], stdout=writer, stderr=subprocess.PIPE, timeout=60)
+    os.close(writer)
+    assert done.returncode == 0 and done.stderr == b""
+
+
+def test_a_full_disk_behind_the_output():
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", SAY + TABLE + "say('a'); show(t); complain('still there'); leave(); sys.exit(7)"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            timeout=60,
+        )
+    assert done.returncode == 7 and done.stderr == b"still there\n"
+
+
+def test_tables_keep_their_width_without_a_terminal():
+    done = python("t.add_column('b' * 150); show(t, 200)")
+    assert "b" * 150 in done.stdout.decode()
