@@ -1,8 +1,6 @@
 """`python -m matd3_jax.crossplay runs=A,B,C`: every run's agents against every run's adversaries."""
 
-import csv
 import dataclasses
-import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,7 +23,7 @@ from matd3_jax.evaluation.cross_play_table import Mean, Pairings, pairs_of
 from matd3_jax.figures import heat_map
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runs.paths import check_new_directory
-from matd3_jax.runtime import devices
+from matd3_jax.runtime import devices, files
 from matd3_jax.training import checkpoint
 from matd3_jax.training.session import TrainingSession
 
@@ -165,24 +163,20 @@ def _words(mean: Mean | None, team: int) -> str:
 
 def _write(out: Path, pairings: Pairings, entrants: Sequence[Entrant], options: CrossPlay) -> None:
     names = [entrant.name for entrant in entrants]
-    with (out / "pairs.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        heading = ("agents", "agents_seed", "adversaries", "adversaries_seed", "pair")
-        writer.writerow((*heading, *(f"return_{team}" for team in TEAMS), "episodes"))
-        for runs, seeds, returns, own in zip(
-            pairings.runs, pairings.seeds, pairings.returns, pairings.own, strict=True
-        ):
-            who = [x for run, k in zip(runs, seeds, strict=True) for x in (names[run], entrants[run].settings.seed + k)]
-            writer.writerow((*who, _kind(own), *(f"{value:.9g}" for value in returns), options.episodes))
-    with (out / "means.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        columns = [name for team in TEAMS for name in (f"return_{team}", f"return_{team}_half_width")]
-        writer.writerow(("agents", "adversaries", "pair", "pairs", *columns))
-        for row in pairings.table():
-            who = ["all" if run is None else names[run] for run in (row.agents, row.adversaries)]
-            values = [f"{x:.9g}" for pair in zip(row.mean.value, row.mean.half, strict=True) for x in pair]
-            writer.writerow((*who, _kind(row.own), row.mean.pairs, *values))
-    runs = {
+    heading = ("agents", "agents_seed", "adversaries", "adversaries_seed", "pair")
+    pairs: list[Sequence[object]] = [(*heading, *(f"return_{team}" for team in TEAMS), "episodes")]
+    for runs, seeds, returns, own in zip(pairings.runs, pairings.seeds, pairings.returns, pairings.own, strict=True):
+        who = [x for run, k in zip(runs, seeds, strict=True) for x in (names[run], entrants[run].settings.seed + k)]
+        pairs.append((*who, _kind(own), *(f"{value:.9g}" for value in returns), options.episodes))
+    files.write_csv(out / "pairs.csv", pairs)
+    columns = [name for team in TEAMS for name in (f"return_{team}", f"return_{team}_half_width")]
+    means: list[Sequence[object]] = [("agents", "adversaries", "pair", "pairs", *columns)]
+    for row in pairings.table():
+        who = ["all" if run is None else names[run] for run in (row.agents, row.adversaries)]
+        values = [f"{x:.9g}" for pair in zip(row.mean.value, row.mean.half, strict=True) for x in pair]
+        means.append((*who, _kind(row.own), row.mean.pairs, *values))
+    files.write_csv(out / "means.csv", means)
+    entered = {
         e.name: {
             "path": str(e.path),
             "checkpoint": e.step,
@@ -192,10 +186,9 @@ def _write(out: Path, pairings: Pairings, entrants: Sequence[Entrant], options: 
         for e in entrants
     }
     chosen = {key: getattr(options, key) for key in ("pairing", "episodes", "deterministic", "seed")}
-    settings = {**chosen, "runs": runs}
-    (out / "crossplay.json").write_text(
-        json.dumps({"env": dict(entrants[0].settings.env), **settings, **devices.versions()}, indent=1) + "\n"
-    )
+    settings = {**chosen, "runs": entered}
+    facts = {"env": dict(entrants[0].settings.env), **settings, **devices.versions()}
+    files.write_json(out / "crossplay.json", facts)
 
 
 def _kind(own: bool) -> str:

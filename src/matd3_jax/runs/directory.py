@@ -19,6 +19,9 @@ from matd3_jax.runs.metrics_table import MetricsTable
 from matd3_jax.runs.paths import check_directory
 from matd3_jax.runtime import files
 
+FORMAT = 1
+"""Of what a run directory holds, in its machine.json; directories without it are of format 0, and are read, too."""
+
 
 class RunDirectory:
     """Where a run leaves its files.
@@ -55,17 +58,51 @@ class RunDirectory:
             raise UserError(f"cannot make the run directory {path}: {error.strerror}") from error
         run = cls(path)
         configuration.write(config, path / "config.yaml")
-        files.write_json(path / "machine.json", machine)
+        files.write_json(path / "machine.json", {"format": FORMAT, **machine})
         return run
 
     @classmethod
     def open(cls, path: Path) -> tuple["RunDirectory", Config]:
-        """An existing run and its settings. Raises UserError if there is none."""
+        """An existing run and its settings. Raises UserError if there is none, or one of a newer format."""
         if not path.is_dir():
             raise UserError(f"there is no run directory {path}")
         if not (path / "config.yaml").is_file():
             raise UserError(f"{path} is no run directory: it has no config.yaml")
-        return cls(path), configuration.read(path / "config.yaml")
+        run = cls(path)
+        if run.format > FORMAT:
+            raise UserError(
+                f"{path} has the format {run.format} of run directories, this version reads up to {FORMAT}: "
+                "use the version of matd3_jax that wrote it, or a newer one"
+            )
+        return run, configuration.read(path / "config.yaml")
+
+    @property
+    def format(self) -> int:
+        """Of what the directory holds: 0 where machine.json does not say."""
+        try:
+            found = json.loads((self.path / "machine.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError):
+            return 0
+        number = found.get("format", 0) if isinstance(found, dict) else 0
+        return number if isinstance(number, int) else 0
+
+    @property
+    def bare(self) -> bool:
+        """Whether the directory was made, and nothing has been trained in it."""
+        if self.path.is_symlink() or not self.path.is_dir():
+            return False
+        own = {"config.yaml", "machine.json", *(left.name for left in files.partial(self.path))}
+        return {found.name for found in self.path.iterdir()} <= own
+
+    def clean(self) -> None:
+        """Take away what killed writes left beside the files, while the lock of the directory is held.
+
+        Raises UserError where what is written in place is a link: what is behind it is not the run's.
+        """
+        for path in (self.metrics, self.checkpoints, self.tensorboard):
+            if path.is_symlink():
+                raise UserError(f"{path} is a link: nothing is written through it")
+        files.remove_partial(self.path)
 
     def append(self, row: Mapping[str, np.ndarray]) -> None:
         """Add one row for each seed to the metrics table. row: columns [seeds], the same ones every time."""

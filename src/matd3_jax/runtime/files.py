@@ -1,15 +1,21 @@
 """Write files whole or not at all: what is replaced stays as it was until its successor is on the disk."""
 
 import contextlib
+import csv
 import errno
+import io
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from matd3_jax.errors import UserError
+
+PARTIAL = re.compile(r"\..+\.\d+\.partial(\.\w+)?")
+"""Names of the files that `replacing` writes beside those that they replace."""
 
 
 @contextlib.contextmanager
@@ -30,6 +36,17 @@ def replacing(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
+def partial(folder: Path) -> list[Path]:
+    """Files in a folder that `replacing` began and a kill left."""
+    return sorted(path for path in folder.glob(".*.partial*") if PARTIAL.fullmatch(path.name) and not path.is_dir())
+
+
+def remove_partial(folder: Path) -> None:
+    """Delete what `partial` finds; nobody else may write there now."""
+    for path in partial(folder):
+        path.unlink(missing_ok=True)
+
+
 def write_text(path: Path, text: str) -> None:
     """Make `text` the content of `path`, in UTF-8; a file that has it already is not touched."""
     data = text.encode()
@@ -43,6 +60,13 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Write a value as JSON that every reader takes: numbers that are not finite are null."""
     write_text(path, json.dumps(_finite(value), indent=1, allow_nan=False) + "\n")
+
+
+def write_csv(path: Path, rows: Iterable[Sequence[Any]], line_end: str = "\r\n") -> None:
+    """Write rows, the names of the columns first, as CSV."""
+    file = io.StringIO(newline="")
+    csv.writer(file, lineterminator=line_end).writerows(rows)
+    write_text(path, file.getvalue())
 
 
 def append_text(path: Path, text: str) -> None:

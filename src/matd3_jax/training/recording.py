@@ -121,6 +121,9 @@ class Recorder:
     def _held(self, directory: RunDirectory) -> Iterator[None]:
         """The directory's lock, which the first process holds for all."""
         with lock.held(directory.path) if self.processes.first else contextlib.nullcontext():
+            if self.processes.first:
+                directory.clean()
+                checkpoint.recover(directory.checkpoints)
             yield
 
     def _from_the_start(self, training: TrainingSession, directory: RunDirectory, stop: Stop | None) -> Recorded:
