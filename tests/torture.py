@@ -16,19 +16,17 @@ import random
 import re
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
-HELPERS = Path(__file__).parent / "helpers"
-sys.path.insert(0, str(HELPERS))
+sys.path.insert(0, str(Path(__file__).parent / "helpers"))
 
 import numpy as np  # noqa: E402
 from checkpoint_arrays import leaves  # noqa: E402
+from disturbed import Ended, Job, Process  # noqa: E402
 
 from matd3_jax.runs.directory import RunDirectory  # noqa: E402
 from matd3_jax.training import checkpoint  # noqa: E402
@@ -39,96 +37,9 @@ SETTINGS = [
 ]  # fmt: skip
 TRAIN = [*SETTINGS, "total_steps=600", "checkpoint_every=200", "keep_checkpoints=3"]
 SWEEP = [*SETTINGS, "total_steps=400", "checkpoint_every=100", "algo.lr=0.01,0.001"]
-LIMIT = 300
-"""Seconds after which a command is taken to hang."""
-
 SAME, SAID, LOST = "resumed to the same bits", "refused in one line", "LOST"
 UNNOTICED = "changed, without a checksum to notice"
 Outcome = str
-
-
-class Job(NamedTuple):
-    """A command, the folder in which it may be disturbed, and how."""
-
-    argv: list[str]
-    folder: Path
-    how: str = ""
-    at: int = -1
-    largest: int | None = None
-    after: float | None = None
-    """Seconds after which it is killed."""
-
-
-class Ended(NamedTuple):
-    """What came of a command."""
-
-    code: int | None
-    """None: it was killed."""
-    output: str
-    calls: list[str]
-
-
-class Process:
-    """A process that serves jobs until it is killed; then another one."""
-
-    def __init__(self, place: Path):
-        self.place, self.number = place, 0
-        self.process: subprocess.Popen | None = None
-
-    def run(self, job: Job) -> Ended:
-        self.begin(job)
-        return self.wait(job.after)
-
-    def begin(self, job: Job) -> None:
-        if self.process is None or self.process.poll() is not None:
-            self.process = subprocess.Popen(
-                [sys.executable, str(HELPERS / "fault_process.py")],
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-            )  # fmt: skip
-            assert self._answer() == "ready"
-        self.number += 1
-        self.output, self.log = (
-            self.place / f"{id(self)}-{self.number}.txt",
-            self.place / f"{id(self)}-{self.number}.log",
-        )
-        given = {"argv": job.argv, "folder": str(job.folder), "how": job.how, "at": job.at, "largest": job.largest}
-        assert self.process.stdin is not None
-        self.process.stdin.write(json.dumps({**given, "output": str(self.output), "log": str(self.log)}) + "\n")
-        self.process.stdin.flush()
-
-    def wait(self, after: float | None = None) -> Ended:
-        assert self.process is not None
-        killer = None
-        if after is not None:
-            import threading
-
-            killer = threading.Timer(after, self.process.kill)
-            killer.start()
-        answer = self._answer()
-        if killer is not None:
-            killer.cancel()
-            killer.join()
-        if not answer:
-            self.process.wait()
-        texts = [path.read_text(errors="replace") if path.exists() else "" for path in (self.output, self.log)]
-        for path in (self.output, self.log):
-            path.unlink(missing_ok=True)
-        return Ended(int(answer) if answer else None, texts[0], texts[1].splitlines())
-
-    def _answer(self) -> str:
-        """The next line of its answers; "" where it died."""
-        import select
-
-        assert self.process is not None and self.process.stdout is not None
-        if not select.select([self.process.stdout], [], [], LIMIT)[0]:
-            self.close()
-            raise TimeoutError(f"a command took more than {LIMIT} s")
-        return self.process.stdout.readline().strip()
-
-    def close(self) -> None:
-        if self.process is not None:
-            self.process.kill()
-            self.process.wait()
 
 
 def train(path: Path) -> list[str]:
@@ -257,16 +168,15 @@ class Torture:
 
     def kill_there(self, fault: str, pattern: str, hows: tuple[str, ...]) -> None:
         path = self.path()
-        there = [k for k, call in enumerate(self.calls) if re.search(pattern, call)]
-        ended = self.process.run(Job(train(path), path, self.rng.choice(hows), self.rng.choice(there)))
+        at = self.rng.randrange(sum(bool(re.search(pattern, call)) for call in self.calls))
+        ended = self.process.run(Job(train(path), path, self.rng.choice(hows), at, pattern))
         self.settle(fault, path, ended)
 
     def kill_at_resumes(self) -> None:
         """Killed again and again, at the resumes too; once by an older checkpoint."""
         path = self.path()
-        ended = self.process.run(
-            Job(train(path), path, "kill", self.rng.randrange(len(self.calls) // 3, len(self.calls)))
-        )
+        at = self.rng.randrange(len(self.calls) // 3, len(self.calls))
+        ended = self.process.run(Job(train(path), path, "kill", at))
         for _ in range(self.rng.randint(1, 3)):
             steps = checkpoint.steps(path / "checkpoints")
             more = [f"checkpoint={steps[0]}"] if len(steps) > 1 and self.rng.random() < 0.5 else []
@@ -277,8 +187,9 @@ class Torture:
 
     def error_at_a_call(self, how: str, calls: str) -> None:
         path = self.path()
-        there = [k for k, call in enumerate(self.calls) if call.split()[0] in calls.split()]
-        ended = self.process.run(Job(train(path), path, how, self.rng.choice(there)))
+        pattern = f"^({'|'.join(calls.split())}) "
+        at = self.rng.randrange(sum(bool(re.search(pattern, call)) for call in self.calls))
+        ended = self.process.run(Job(train(path), path, how, at, pattern))
         self.settle({"short": "short write"}.get(how, how), path, ended)
 
     def file_limit(self) -> None:
@@ -290,7 +201,7 @@ class Torture:
     def damage_a_checkpoint(self) -> None:
         """The last checkpoint: it is refused by name, the one before it leads to the same bits."""
         path = self.back()
-        last, before = checkpoint.steps(path / "checkpoints")[:0:-1][:2] if False else self.last_two(path)
+        *_, before, last = checkpoint.steps(path / "checkpoints")
         file = self.rng.choice([one for one in (path / "checkpoints" / str(last)).rglob("*") if one.is_file()])
         what = self.damage(file)
         ended = self.process.run(Job(resume(path), path))
@@ -339,20 +250,16 @@ class Torture:
     def kill_a_plan(self) -> None:
         """A sweep that is killed while it plans is started again with the same command."""
         path = self.path()
-        last = next(k for k, call in enumerate(self.sweep_calls) if re.search(r"replace sweep\.json", call))
         how = self.rng.choice(["kill", "kill after", "half"])
-        ended = self.process.run(Job(sweep(path, "train=false"), path, how, self.rng.randrange(last + 1)))
+        ended = self.process.run(Job(sweep(path, "train=false"), path, how, self.rng.randrange(self.planned() + 1)))
         again = self.process.run(Job(sweep(path, "train=false"), path))
         if again.code == 2 and (path / "sweep.json").exists():
             again = again._replace(code=0)  # the plan was there already
         self.compare_sweeps("sweep killed while it plans", path, ended, again, trained=False)
 
     def kill_a_sweep(self) -> None:
-        path, begun = self.path(), 0
-        for begun, call in enumerate(self.sweep_calls):
-            if call.startswith("replace sweep.json"):
-                break
-        at = self.rng.randrange(begun + 3, len(self.sweep_calls))
+        path = self.path()
+        at = self.rng.randrange(self.planned() + 3, len(self.sweep_calls))
         ended = self.process.run(Job(sweep(path), path, self.rng.choice(["kill", "kill after", "half"]), at))
         again = self.process.run(Job(["sweep", f"resume={path}"], path))
         self.compare_sweeps("sweep killed while it trains", path, ended, again, trained=True)
@@ -386,10 +293,9 @@ class Torture:
             (path / name).unlink()
         return path
 
-    @staticmethod
-    def last_two(path: Path) -> tuple[int, int]:
-        *_, before, last = checkpoint.steps(path / "checkpoints")
-        return last, before
+    def planned(self) -> int:
+        """Number of the call with which a sweep's plan is complete."""
+        return next(k for k, call in enumerate(self.sweep_calls) if call == "replace sweep.json")
 
     def damage(self, file: Path) -> str:
         data = bytearray(file.read_bytes())
@@ -415,7 +321,8 @@ class Torture:
         return [
             self.kill_at_a_call, self.kill_at_a_time,
             there(self.kill_there, "SIGKILL inside a checkpoint", r"checkpoints/\.", ("kill", "half")),
-            there(self.kill_there, "SIGKILL as a checkpoint gets its name", r"^rename checkpoints/\d+$", ("kill", "kill after")),
+            there(self.kill_there, "SIGKILL as a checkpoint gets its name", r"^rename checkpoints/\d+$",
+                  ("kill", "kill after")),
             there(self.kill_there, "SIGKILL within a row", r"^write metrics\.csv", ("half", "kill after")),
             there(self.kill_there, "SIGKILL at the end", r"learning_curve|summary", ("kill", "kill after", "half")),
             self.kill_at_resumes,

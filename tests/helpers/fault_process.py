@@ -1,7 +1,7 @@
 """A process that runs commands one after the other, as `matd3 COMMAND ...` would, and fails or dies where it is told.
 
 Jobs come as lines of JSON on its standard input: {"argv", "folder" (which is watched), "output", "log", "how", "at",
-"largest"}; the exit code of each goes to its standard output. Imports and compiled programs serve all jobs.
+"where", "largest"}; the exit code of each goes to its standard output. Imports and compiled programs serve all jobs.
 """
 
 import contextlib
@@ -20,8 +20,8 @@ from matd3_jax.figures import learning_curves  # noqa: F401
 
 def run(job: dict) -> int:
     """The exit code of a command; 1 after a traceback."""
-    fault = faults.Faults(Path(job["folder"]), Path(job["log"]), job.get("how", ""), job.get("at", -1))
-    with faults.armed(fault, job.get("largest")):
+    fault = faults.Faults(Path(job["folder"]), Path(job["log"]), job["how"], job["at"], job["where"])
+    with faults.armed(fault, job["largest"]):
         try:
             return command.code(main.main, job["argv"])
         except SystemExit as ended:

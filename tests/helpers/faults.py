@@ -5,8 +5,10 @@ import contextlib
 import errno
 import io
 import os
+import re
 import resource
 import signal
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,10 +26,11 @@ class Faults:
         log: gets a line "CALL PATH" before each call, so that it is known where a process died.
         how: "kill" (before the call), "kill after", "half" (half of what is written, then killed), "short" (half of it,
             as a system may write), one of `ERRORS`; "": nothing.
-        at: number of the call, from 0.
+        at: number of the call, from 0, among those that `where` matches, a pattern for "CALL PATH".
     """
 
-    def __init__(self, folder: Path, log: Path, how: str = "", at: int = -1):
+    def __init__(self, folder: Path, log: Path, how: str = "", at: int = -1, where: str = ""):
+        self.where, self.counting = re.compile(where), threading.Lock()  # Orbax writes in several threads
         self.folder, self.how, self.at, self.count = f"{folder.resolve()}{os.sep}", how, at, 0
         self.log = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
         self.original = {name: getattr(os, name) for name in (*BY_PATH, "open", "write", "fsync")}
@@ -47,9 +50,12 @@ class Faults:
 
     def _begin(self, call: str, path: str) -> str:
         """Note a call: the fault that is due now."""
-        due = self.how if self.count == self.at or (self.how == "ENOSPC" and 0 <= self.at < self.count) else ""
-        self.original["write"](self.log, f"{call} {path}{' <- ' + due if due else ''}\n".encode())
-        self.count += 1
+        due = ""
+        with self.counting:
+            if self.where.search(f"{call} {path}"):
+                due = self.how if self.count == self.at or (self.how == "ENOSPC" and 0 <= self.at < self.count) else ""
+                self.count += 1
+            self.original["write"](self.log, f"{call} {path}\n".encode())
         if due == "kill" or (due == "half" and call != "write"):
             os.kill(os.getpid(), signal.SIGKILL)
         if due in ERRORS and call in ("open", "write", "mkdir", "fsync", "replace", "rename"):
