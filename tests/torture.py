@@ -38,6 +38,9 @@ SETTINGS = [
 TRAIN = [*SETTINGS, "total_steps=600", "checkpoint_every=200", "keep_checkpoints=3"]
 SWEEP = [*SETTINGS, "total_steps=400", "checkpoint_every=100", "algo.lr=0.01,0.001"]
 SAME, SAID, LOST = "resumed to the same bits", "refused in one line", "LOST"
+KINDS = 16
+"""How many `Torture.trials` there are."""
+
 UNNOTICED = "changed, without a checksum to notice"
 Outcome = str
 
@@ -318,7 +321,7 @@ class Torture:
     def trials(self) -> list[Callable[[], None]]:
         """One of each kind, in the order of a round."""
         there = functools.partial
-        return [
+        found = [
             self.kill_at_a_call, self.kill_at_a_time,
             there(self.kill_there, "SIGKILL inside a checkpoint", r"checkpoints/\.", ("kill", "half")),
             there(self.kill_there, "SIGKILL as a checkpoint gets its name", r"^rename checkpoints/\d+$",
@@ -332,6 +335,8 @@ class Torture:
             self.file_limit, self.damage_a_checkpoint, self.damage_another_file, self.two_at_once,
             self.kill_a_plan, self.kill_a_sweep,
         ]  # fmt: skip
+        assert len(found) == KINDS
+        return found
 
     def report(self) -> str:
         """The table, as Markdown."""
