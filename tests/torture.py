@@ -38,7 +38,7 @@ SETTINGS = [
 TRAIN = [*SETTINGS, "total_steps=600", "checkpoint_every=200", "keep_checkpoints=3"]
 SWEEP = [*SETTINGS, "total_steps=400", "checkpoint_every=100", "algo.lr=0.01,0.001"]
 SAME, SAID, LOST = "resumed to the same bits", "refused in one line", "LOST"
-KINDS = 16
+KINDS = 17
 """How many `Torture.trials` there are."""
 
 UNNOTICED = "changed, without a checksum to notice"
@@ -163,6 +163,12 @@ class Torture:
         path, how = self.path(), self.rng.choice(["kill", "kill after", "half"])
         ended = self.process.run(Job(train(path), path, how, self.rng.randrange(len(self.calls))))
         self.settle("SIGKILL at a random call", path, ended)
+
+    def power_cut(self) -> None:
+        """At a random call; of every file is left what was synced."""
+        path = self.path()
+        ended = self.process.run(Job(train(path), path, "power", self.rng.randrange(len(self.calls))))
+        self.settle("power cut at a random call", path, ended)
 
     def kill_at_a_time(self) -> None:
         path = self.path()
@@ -322,7 +328,7 @@ class Torture:
         """One of each kind, in the order of a round."""
         there = functools.partial
         found = [
-            self.kill_at_a_call, self.kill_at_a_time,
+            self.kill_at_a_call, self.kill_at_a_time, self.power_cut,
             there(self.kill_there, "SIGKILL inside a checkpoint", r"checkpoints/\.", ("kill", "half")),
             there(self.kill_there, "SIGKILL as a checkpoint gets its name", r"^rename checkpoints/\d+$",
                   ("kill", "kill after")),

@@ -27,12 +27,14 @@ OWN = {
     "matd3_jax.sweep": {"resume", "batch", *sweep.OPTIONS, *slurm.KEYS},
     "matd3_jax.plot": {"runs"},
     "matd3_jax.crossplay": {"runs"},
+    "matd3_jax.check": {"run", "sweep"},
+    "tests.torture": {"minutes", "seed"},
     "benchmarks.guard": {"record"},
     "experiments.all": {"skip", *study.OPTIONS},
     "experiments.cooperative_navigation": {"seeds", "total_steps", "out"},
 }
 """Keys of commands that are neither settings of a run nor in the command's `DEFAULTS`."""
-CLOSED = ("evaluate", "render", "plot", "crossplay", "peers", "gpu")
+CLOSED = ("evaluate", "render", "plot", "crossplay", "check", "torture", "peers", "gpu")
 """Commands that take no settings of a run."""
 PLACEHOLDER = re.compile(r"[A-Z][A-Z_,]*(/[\w.]+)?|\$\w+|value")
 """A value that stands for the reader's own."""

@@ -24,8 +24,9 @@ class Faults:
 
     Args:
         log: gets a line "CALL PATH" before each call, so that it is known where a process died.
-        how: "kill" (before the call), "kill after", "half" (half of what is written, then killed), "short" (half of it,
-            as a system may write), one of `ERRORS`; "": nothing.
+        how: "kill" (before the call), "kill after", "half" (half of what is written, then killed), "power" (killed, and
+            of every file is left what was synced), "short" (half of it, as a system may write), one of `ERRORS`; "":
+            nothing.
         at: number of the call, from 0, among those that `where` matches, a pattern for "CALL PATH".
     """
 
@@ -35,6 +36,8 @@ class Faults:
         self.log = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
         self.original = {name: getattr(os, name) for name in (*BY_PATH, "open", "write", "fsync")}
         self.open = io.open
+        self.synced = {file.stat().st_ino: file.stat().st_size for file in self._files()}
+        """How much of each file, by its inode, is on the disk."""
 
     def _inside(self, path: Any, folder: Any = None) -> str | None:
         """The part of a path (or of what a descriptor stands for) below the folder; None: it is elsewhere."""
@@ -56,12 +59,29 @@ class Faults:
                 due = self.how if self.count == self.at or (self.how == "ENOSPC" and 0 <= self.at < self.count) else ""
                 self.count += 1
             self.original["write"](self.log, f"{call} {path}\n".encode())
-        if due == "kill" or (due == "half" and call != "write"):
+        if due == "power":
+            self._lose_what_is_not_synced()
+        if due in ("kill", "power") or (due == "half" and call != "write"):
             os.kill(os.getpid(), signal.SIGKILL)
         if due in ERRORS and call in ("open", "write", "mkdir", "fsync", "replace", "rename"):
             if due == "EIO" or call in ("open", "write", "mkdir"):
                 raise OSError(ERRORS[due], os.strerror(ERRORS[due]), path)
         return due
+
+    def _files(self) -> list[Path]:
+        folder = Path(self.folder)
+        return [file for file in folder.rglob("*") if file.is_file() and not file.is_symlink()]
+
+    def _lose_what_is_not_synced(self) -> None:
+        for file in self._files():
+            found = file.stat()
+            if found.st_size > self.synced.get(found.st_ino, 0):
+                self.original["truncate"](file, self.synced.get(found.st_ino, 0))
+
+    def sync(self, file: int) -> None:
+        self.call("fsync", 0, file)
+        found = os.fstat(file)
+        self.synced[found.st_ino] = found.st_size
 
     def _end(self, due: str) -> None:
         if due in ("kill after", "half"):
@@ -71,6 +91,11 @@ class Faults:
         folder = given.get("dir_fd", given.get("dst_dir_fd"))
         path = self._inside(args[where], folder)
         due = "" if path is None else self._begin(name, path)
+        if name == "unlink" and path is not None:
+            try:
+                self.synced.pop(os.lstat(self.folder + path).st_ino, None)  # another file may get this inode
+            except OSError:
+                pass
         found = self.original[name](*args, **given)
         self._end(due)
         return found
@@ -143,7 +168,7 @@ def armed(faults: Faults, largest: int | None = None) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (largest, before[1]))
     for name, where in BY_PATH.items():
         setattr(os, name, lambda *args, name=name, where=where, **given: faults.call(name, where, *args, **given))
-    os.fsync = lambda file: faults.call("fsync", 0, file)
+    os.fsync = faults.sync
     os.write, os.open = faults.write, faults.os_open
     io.open = builtins.open = faults.io_open  # type: ignore[assignment]
     try:

@@ -109,6 +109,12 @@ class RunDirectory:
         new = not self.metrics.exists() or not self.metrics.stat().st_size
         files.append_text(self.metrics, metrics_table.row_lines(row, header=new))
 
+    def sync(self) -> None:
+        """Bring the metrics table to the disk, before a checkpoint that has its rows behind it gets its name."""
+        if self.metrics.exists():
+            files.sync(self.metrics)
+            files.sync_folder(self.path)
+
     def clear(self) -> None:
         """Take away all but settings and machine: the run begins anew."""
         for path in (self.metrics, self.curve, self.path / "summary.json"):

@@ -29,7 +29,7 @@ def replacing(path: Path) -> Iterator[Path]:
     partial.unlink(missing_ok=True)
     try:
         yield partial
-        _sync(partial)
+        sync(partial)
         os.replace(partial, path)
         sync_folder(path.parent)
     finally:
@@ -103,7 +103,8 @@ def sync_folder(folder: Path) -> None:
             os.close(handle)
 
 
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Bring what was written to a file to the disk."""
     handle = os.open(path, os.O_RDWR)
     try:
         os.fsync(handle)

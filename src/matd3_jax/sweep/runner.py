@@ -218,6 +218,8 @@ class Batch:
                 loggers.append(TensorBoardLogger(self.runs, self.seeds))
 
         def save(state: TrainState, step: int) -> None:
+            for run in self.runs if self.processes.first else ():
+                run.sync()
             checkpoint.save(self.checkpoints, step, training.trainer, state, keep=1, share=training.share)
 
         outcome = training_run.run(training, state, row, loggers, save, stop, save_first=fresh)

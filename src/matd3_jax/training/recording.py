@@ -202,6 +202,8 @@ class Recorder:
 
         def save(state: TrainState, step: int) -> None:
             keep = settings.keep_checkpoints
+            if self.processes.first:
+                directory.sync()
             checkpoint.save(directory.checkpoints, step, training.trainer, state, keep, share=training.share)
 
         outcome = run(training, state, row, loggers, save, stop, save_first=fresh)
