@@ -103,17 +103,17 @@ class Torture:
 
     def __post_init__(self) -> None:
         self.process, self.other = Process(self.place), Process(self.place)
-        self.whole, self.whole_sweep = self.place / "whole", self.place / "whole_sweep"
+        self.whole, self.whole_sweep = self.place / "whole" / "run", self.place / "whole sweep" / "sweep"
         begun = time.monotonic()
-        first = self.process.run(Job(train(self.whole), self.whole))
+        first = self.process.run(Job(train(self.whole), self.whole.parent))
         assert first.code == 0, first.output
         self.calls = first.calls
-        again = self.place / "again"
+        again = self.place / "again" / "run"
         begun = time.monotonic()
-        assert self.process.run(Job(train(again), again)).code == 0
+        assert self.process.run(Job(train(again), again.parent)).code == 0
         self.seconds = time.monotonic() - begun
         assert same(again, self.whole) == ""
-        swept = self.process.run(Job(sweep(self.whole_sweep), self.whole_sweep))
+        swept = self.process.run(Job(sweep(self.whole_sweep), self.whole_sweep.parent))
         assert swept.code == 0, swept.output
         self.sweep_calls = swept.calls
         self.number = 0
@@ -122,9 +122,12 @@ class Torture:
         self.process.close()
         self.other.close()
 
-    def path(self) -> Path:
+    def path(self, kind: str = "run") -> Path:
+        """A new directory's, which has a folder to itself."""
         self.number += 1
-        return self.place / f"run{self.number}"
+        folder = self.place / f"trial{self.number}"
+        folder.mkdir()
+        return folder / kind
 
     def note(self, fault: str, ended: Ended | None, outcome: Outcome, detail: str = "") -> None:
         if ended is None:
@@ -142,12 +145,10 @@ class Torture:
 
     def start_or_resume(self, path: Path) -> Ended:
         """What a user does after a run ended before its time."""
-        return self.process.run(Job(resume(path) if (path / "config.yaml").exists() else train(path), path))
+        return self.process.run(Job(resume(path) if path.exists() else train(path), path.parent))
 
     def settle(self, fault: str, path: Path, ended: Ended) -> None:
         """Resume a run after a fault, and note whether it comes to the unbroken run's bits."""
-        if not (path / "config.yaml").exists() and path.exists():  # killed in the instant after it was made
-            shutil.rmtree(path)
         again = self.start_or_resume(path)
         if again.code == 2 and "raise total_steps=" in again.output:
             again = again._replace(code=0)  # it had come to its end before the fault
@@ -155,56 +156,56 @@ class Torture:
         last = ended.calls[-1] if ended.calls else "-"
         self.note(fault, ended, LOST if wrong else SAME, f"after {last}: {wrong}")
         if not wrong:
-            shutil.rmtree(path)
+            shutil.rmtree(path.parent)
 
     # ---- the faults ----------------------------------------------------------------------------------------------
 
     def kill_at_a_call(self) -> None:
         path, how = self.path(), self.rng.choice(["kill", "kill after", "half"])
-        ended = self.process.run(Job(train(path), path, how, self.rng.randrange(len(self.calls))))
+        ended = self.process.run(Job(train(path), path.parent, how, self.rng.randrange(len(self.calls))))
         self.settle("SIGKILL at a random call", path, ended)
 
     def power_cut(self) -> None:
         """At a random call; of every file is left what was synced."""
         path = self.path()
-        ended = self.process.run(Job(train(path), path, "power", self.rng.randrange(len(self.calls))))
+        ended = self.process.run(Job(train(path), path.parent, "power", self.rng.randrange(len(self.calls))))
         self.settle("power cut at a random call", path, ended)
 
     def kill_at_a_time(self) -> None:
         path = self.path()
-        ended = self.process.run(Job(train(path), path, after=self.rng.uniform(0, 1.1 * self.seconds)))
+        ended = self.process.run(Job(train(path), path.parent, after=self.rng.uniform(0, 1.1 * self.seconds)))
         self.settle("SIGKILL at a random time", path, ended)
 
     def kill_there(self, fault: str, pattern: str, hows: tuple[str, ...]) -> None:
         path = self.path()
         at = self.rng.randrange(sum(bool(re.search(pattern, call)) for call in self.calls))
-        ended = self.process.run(Job(train(path), path, self.rng.choice(hows), at, pattern))
+        ended = self.process.run(Job(train(path), path.parent, self.rng.choice(hows), at, pattern))
         self.settle(fault, path, ended)
 
     def kill_at_resumes(self) -> None:
         """Killed again and again, at the resumes too; once by an older checkpoint."""
         path = self.path()
         at = self.rng.randrange(len(self.calls) // 3, len(self.calls))
-        ended = self.process.run(Job(train(path), path, "kill", at))
+        ended = self.process.run(Job(train(path), path.parent, "kill", at))
         for _ in range(self.rng.randint(1, 3)):
             steps = checkpoint.steps(path / "checkpoints")
             more = [f"checkpoint={steps[0]}"] if len(steps) > 1 and self.rng.random() < 0.5 else []
             how = self.rng.choice(["kill", "kill after", "half"])
-            if (path / "config.yaml").exists():
-                ended = self.process.run(Job(resume(path, *more), path, how, self.rng.randrange(40)))
+            if path.exists():
+                ended = self.process.run(Job(resume(path, *more), path.parent, how, self.rng.randrange(40)))
         self.settle("SIGKILL at several resumes", path, ended)
 
     def error_at_a_call(self, how: str, calls: str) -> None:
         path = self.path()
         pattern = f"^({'|'.join(calls.split())}) "
         at = self.rng.randrange(sum(bool(re.search(pattern, call)) for call in self.calls))
-        ended = self.process.run(Job(train(path), path, how, at, pattern))
+        ended = self.process.run(Job(train(path), path.parent, how, at, pattern))
         self.settle({"short": "short write"}.get(how, how), path, ended)
 
     def file_limit(self) -> None:
         """No file may grow beyond some bytes: fails in Orbax's C++, too."""
         path = self.path()
-        ended = self.process.run(Job(train(path), path, largest=self.rng.choice([100, 1000, 3000, 6000, 12000])))
+        ended = self.process.run(Job(train(path), path.parent, largest=self.rng.choice([100, 1000, 3000, 6000, 12000])))
         self.settle("EFBIG (also in C++)", path, ended)
 
     def damage_a_checkpoint(self) -> None:
@@ -213,21 +214,21 @@ class Torture:
         *_, before, last = checkpoint.steps(path / "checkpoints")
         file = self.rng.choice([one for one in (path / "checkpoints" / str(last)).rglob("*") if one.is_file()])
         what = self.damage(file)
-        ended = self.process.run(Job(resume(path), path))
+        ended = self.process.run(Job(resume(path), path.parent))
         fault = f"checkpoint file {what}"
         if not (one_line(ended) and "is damaged" in ended.output and f"checkpoint={before}" in ended.output):
             return self.note(fault, None, LOST, f"{file.relative_to(path)}: {ended.output[-600:]}")
-        again = self.process.run(Job(resume(path, f"checkpoint={before}"), path))
+        again = self.process.run(Job(resume(path, f"checkpoint={before}"), path.parent))
         wrong = again.output[-600:] if again.code else same(path, self.whole)
         self.note(fault, ended, LOST if wrong else f"named; the checkpoint before it {SAME}", wrong)
-        shutil.rmtree(path)
+        shutil.rmtree(path.parent)
 
     def damage_another_file(self) -> None:
         path = self.back()
         name = self.rng.choice(["metrics.csv", "config.yaml", "machine.json", ".lock"])
         (path / name).touch()
         what = self.damage(path / name)
-        ended = self.process.run(Job(resume(path), path))
+        ended = self.process.run(Job(resume(path), path.parent))
         fault = f"{name} {what}"
         if ended.code == 0:
             wrong = same(path, self.whole)
@@ -239,13 +240,13 @@ class Torture:
                 self.note(fault, None, UNNOTICED)
         else:
             self.note(fault, None, SAID if one_line(ended) else LOST, ended.output[-600:])
-        shutil.rmtree(path)
+        shutil.rmtree(path.parent)
 
     def two_at_once(self) -> None:
         path = self.back()
         ended = []
         for process in (self.process, self.other):
-            process.begin(Job(resume(path), path))
+            process.begin(Job(resume(path), path.parent))
         for process in (self.process, self.other):
             ended.append(process.wait())
         codes = sorted(str(one.code) for one in ended)
@@ -254,23 +255,25 @@ class Torture:
         wrong = f"exit codes {codes}" if codes != ["0", "2"] or not said else same(path, self.whole)
         outcome = LOST if wrong else "one refused in one line, the other to the same bits"
         self.note("two processes at once", None, outcome, wrong or "")
-        shutil.rmtree(path)
+        shutil.rmtree(path.parent)
 
     def kill_a_plan(self) -> None:
         """A sweep that is killed while it plans is started again with the same command."""
-        path = self.path()
+        path = self.path("sweep")
         how = self.rng.choice(["kill", "kill after", "half"])
-        ended = self.process.run(Job(sweep(path, "train=false"), path, how, self.rng.randrange(self.planned() + 1)))
-        again = self.process.run(Job(sweep(path, "train=false"), path))
+        ended = self.process.run(
+            Job(sweep(path, "train=false"), path.parent, how, self.rng.randrange(self.planned() + 1))
+        )
+        again = self.process.run(Job(sweep(path, "train=false"), path.parent))
         if again.code == 2 and (path / "sweep.json").exists():
             again = again._replace(code=0)  # the plan was there already
         self.compare_sweeps("sweep killed while it plans", path, ended, again, trained=False)
 
     def kill_a_sweep(self) -> None:
-        path = self.path()
+        path = self.path("sweep")
         at = self.rng.randrange(self.planned() + 3, len(self.sweep_calls))
-        ended = self.process.run(Job(sweep(path), path, self.rng.choice(["kill", "kill after", "half"]), at))
-        again = self.process.run(Job(["sweep", f"resume={path}"], path))
+        ended = self.process.run(Job(sweep(path), path.parent, self.rng.choice(["kill", "kill after", "half"]), at))
+        again = self.process.run(Job(["sweep", f"resume={path}"], path.parent))
         self.compare_sweeps("sweep killed while it trains", path, ended, again, trained=True)
 
     def compare_sweeps(self, fault: str, path: Path, ended: Ended, again: Ended, trained: bool) -> None:
@@ -289,7 +292,7 @@ class Torture:
         self.note(fault, ended, LOST if wrong else SAME if trained else "planned again, the same batches",
                   f"after {ended.calls[-1] if ended.calls else '-'}: {wrong}")  # fmt: skip
         if not wrong:
-            shutil.rmtree(path)
+            shutil.rmtree(path.parent)
 
     # ---- what they share -----------------------------------------------------------------------------------------
 
@@ -304,7 +307,7 @@ class Torture:
 
     def planned(self) -> int:
         """Number of the call with which a sweep's plan is complete."""
-        return next(k for k, call in enumerate(self.sweep_calls) if call == "replace sweep.json")
+        return next(k for k, call in enumerate(self.sweep_calls) if call == "replace sweep/sweep.json")
 
     def damage(self, file: Path) -> str:
         data = bytearray(file.read_bytes())
@@ -330,9 +333,9 @@ class Torture:
         found = [
             self.kill_at_a_call, self.kill_at_a_time, self.power_cut,
             there(self.kill_there, "SIGKILL inside a checkpoint", r"checkpoints/\.", ("kill", "half")),
-            there(self.kill_there, "SIGKILL as a checkpoint gets its name", r"^rename checkpoints/\d+$",
+            there(self.kill_there, "SIGKILL as a checkpoint gets its name", r"^rename run/checkpoints/\d+$",
                   ("kill", "kill after")),
-            there(self.kill_there, "SIGKILL within a row", r"^write metrics\.csv", ("half", "kill after")),
+            there(self.kill_there, "SIGKILL within a row", r"^write run/metrics\.csv", ("half", "kill after")),
             there(self.kill_there, "SIGKILL at the end", r"learning_curve|summary", ("kill", "kill after", "half")),
             self.kill_at_resumes,
             there(self.error_at_a_call, "ENOSPC", "open write mkdir"),

@@ -49,17 +49,27 @@ class RunDirectory:
 
     @classmethod
     def create(cls, path: Path, config: Config, machine: Mapping[str, Any]) -> "RunDirectory":
-        """Make the directory. Raises UserError if it is there already or cannot be made."""
+        """Make the directory, which gets its name with its settings in it: a kill leaves none without.
+
+        Raises UserError if it is there already or cannot be made.
+        """
+        new = path.with_name(f".run.{os.getpid()}.partial")
         try:
-            path.mkdir(parents=True)
-        except FileExistsError:
-            raise UserError(_there(path)) from None
+            shutil.rmtree(new, ignore_errors=True)
+            new.mkdir(parents=True)
+            configuration.write(config, new / "config.yaml")
+            files.write_json(new / "machine.json", {"format": FORMAT, **machine})
+            if path.exists():
+                raise UserError(_there(path))
+            new.rename(path)  # which fails where another process was quicker
+            files.sync_folder(path.parent)
         except OSError as error:
+            if path.exists():
+                raise UserError(_there(path)) from None
             raise UserError(f"cannot make the run directory {path}: {error.strerror}") from error
-        run = cls(path)
-        configuration.write(config, path / "config.yaml")
-        files.write_json(path / "machine.json", {"format": FORMAT, **machine})
-        return run
+        finally:
+            shutil.rmtree(new, ignore_errors=True)
+        return cls(path)
 
     @classmethod
     def open(cls, path: Path) -> tuple["RunDirectory", Config]:
