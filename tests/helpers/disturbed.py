@@ -8,7 +8,7 @@ import threading
 from pathlib import Path
 from typing import NamedTuple
 
-LIMIT = 300
+LIMIT = 900
 """Seconds after which a command is taken to hang."""
 
 
