@@ -89,6 +89,7 @@ def lose_rows(run):
 
 
 def lose_all_rows(run):
+    shutil.rmtree(run / "checkpoints" / str(checkpoint.steps(run / "checkpoints")[-1]))  # there are rows to come
     (run / "metrics.csv").unlink()
     return ["lacks rows between env steps 0 and", "metrics: none yet"]
 
@@ -151,7 +152,7 @@ def test_a_process_that_works_there_is_named(run, capsys):
 
 def test_where_there_is_no_run(run, tmp_path):
     (tmp_path / "empty").mkdir()
-    (run / "config.yaml").write_text("env: [")
+    (run / "config.yaml").write_text("[]")
     for path in (tmp_path / "empty", tmp_path / "nothing", run):
         with pytest.raises(UserError):
             check.main([f"run={path}"])
@@ -183,5 +184,6 @@ def test_a_sweep(tmp_path, capsys):
     for name in ("sweep.json", "table.csv", "seeds.csv", "sweep.png"):
         (folder / name).unlink()
     shutil.rmtree(folder / "runs")
+    shutil.rmtree(folder / "batches")
     code, said = checked(folder, capsys, "sweep")
     assert code == 1 and "its planning was cut short" in said

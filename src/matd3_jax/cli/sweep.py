@@ -77,7 +77,8 @@ def _plan(
 ) -> None:
     """Make the sweep's directory, and say what is in it."""
     sweep = Sweep(folder, processes)
-    if not sweep.unfinished_plan():
+    empty = folder.is_dir() and not any(folder.iterdir())  # a process was killed just as it had made it
+    if not empty and not sweep.unfinished_plan():
         RunDirectory.check_new(folder)
     with sweep.planning():
         if (folder / "sweep.json").exists():  # another process was quicker

@@ -87,7 +87,7 @@ class Sweep:
         if not self.folder.is_dir() or not all(RunDirectory(path).bare for path in _entries(self.runs)):
             return False
         own = {lock.NAME, self.runs.name, self._plan.name, *(path.name for path in files.partial(self.folder))}
-        return {path.name for path in self.folder.iterdir()} <= own
+        return set() < {path.name for path in self.folder.iterdir()} <= own
 
     def discard_plan(self) -> None:
         """Take away what `unfinished_plan` found, while the folder is held."""
