@@ -12,6 +12,7 @@ from hydra.core.override_parser.types import Override, OverrideType, ValueType
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from matd3_jax.config.coerce import typed
 from matd3_jax.config.schema import ADDED_LATER, RENAMED, TEXTS, AlgoConfig, Config, DiagnosticsConfig
@@ -125,7 +126,7 @@ def read(path: Path) -> Config:
             physics = values["env"]["physics"]
             values["env"] = {**values["env"], "physics": RENAMED.get(physics, physics)}
         return from_dict(values)
-    except (OSError, AssertionError, ValueError, OmegaConfBaseException) as error:
+    except (OSError, AssertionError, ValueError, OmegaConfBaseException, YAMLError) as error:
         raise UserError(f"cannot read the configuration {path}: {_one_line(error)}") from error
 
 
