@@ -59,7 +59,7 @@ def draw(path: Path, axes: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
         _limits(grid[1], [[p["memory"][key] / 1e6 for key in MEMORY] for points in columns.values() for p in points])
         for row in grid:
             row[-1].legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False, handlelength=2)
-        figure.savefig(path, dpi=200)
+        style.save(figure, path, dpi=200)
 
 
 def _line(axis: Axes, x: np.ndarray, y: np.ndarray, color: Color, label: str) -> None:

@@ -26,7 +26,7 @@ from matd3_jax import config
 from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option
 from matd3_jax.errors import UserError
-from matd3_jax.runtime import devices
+from matd3_jax.runtime import devices, files
 
 RECORDED = Path(__file__).with_suffix(".json")
 SETTINGS = ("env=simple_spread", "seeds=4", "replay_capacity=100000", "total_steps=100000", "eval_every=0")
@@ -73,14 +73,14 @@ def main(argv: Sequence[str]) -> int:
     begun = time.monotonic()
     devices.prepare()
     platform = jax.default_backend()
-    found = json.loads(RECORDED.read_text()) if RECORDED.exists() else {}
+    found = json.loads(RECORDED.read_text(encoding="utf-8")) if RECORDED.exists() else {}
     if not record and platform not in found:
         raise UserError(f"{RECORDED} holds nothing for {platform}: record it with record=true")
     ratios, spread = measure()
     if record:
         about = {"machine": devices.description(), "versions": devices.versions(), "commit": commit()}
         found[platform] = {**about, "ratios": ratios, "in_turns": spread}
-        RECORDED.write_text(json.dumps(found, indent=1) + "\n")
+        files.write_json(RECORDED, found)
         print(f"written to {RECORDED}")
     recorded = found[platform]["ratios"]
     for key, bound in BOUNDS.items():

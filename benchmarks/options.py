@@ -1,12 +1,12 @@
 """Options that most benchmarks have, and their report."""
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from matd3_jax.cli.options import option, others
+from matd3_jax.runtime import files
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Reported:
     def write(self, report: Mapping[str, Any]) -> None:
         """Write the report, if a file is wanted."""
         if self.out is not None:
-            self.out.write_text(json.dumps(report, indent=1) + "\n")
+            files.write_json(self.out, report)
 
 
 @dataclasses.dataclass(frozen=True)

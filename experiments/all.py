@@ -28,6 +28,7 @@ from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option, others
 from matd3_jax.errors import UserError, nearest
 from matd3_jax.runs.paths import check_directory
+from matd3_jax.runtime import files
 
 STUDIES: dict[str, Study] = {
     module.STUDY.name: module.STUDY
@@ -90,7 +91,7 @@ def main(argv: Sequence[str]) -> int:
     head = ["# The paper's claims, one by one" + (" (small runs)" if small else ""), "", verdict.DEFINITIONS, ""]
     given.out.mkdir(parents=True, exist_ok=True)
     summary = given.out / ("summary_small.md" if small else "summary.md")
-    summary.write_text("\n".join([*head, *lines]).rstrip() + "\n")
+    files.write_text(summary, "\n".join([*head, *lines]).rstrip() + "\n")
     print(f"\nsummary: {summary}")
     return failed
 

@@ -19,6 +19,7 @@ from matd3_jax.config import Config
 from matd3_jax.config.schema import UNREPORTED
 from matd3_jax.errors import UserError
 from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.runtime import files
 
 UNFINISHED = "not finished"
 
@@ -72,7 +73,7 @@ def read(table: Path, facts: Path, keys: Mapping[str, str]) -> Data:
     if not (table.exists() and facts.exists()):
         return data
     rows = tidy.read(table)
-    for label, fact in json.loads(facts.read_text()).items():
+    for label, fact in json.loads(facts.read_text(encoding="utf-8")).items():
         data.facts[label] = fact
         values = key_values(keys, fact["settings"])
         part = rows.where(**{key: value for key, value in values.items() if key in rows})
@@ -86,7 +87,7 @@ def read(table: Path, facts: Path, keys: Mapping[str, str]) -> Data:
 
 def write(data: Data, table: Path, facts: Path) -> None:
     tidy.write(data.table, table)
-    facts.write_text(json.dumps(data.facts, indent=1) + "\n")
+    files.write_json(facts, data.facts)
 
 
 # ---- settings --------------------------------------------------------------------------------------------------------
@@ -156,8 +157,8 @@ def gather(keys: Mapping[str, str], paths: Sequence[Path], command: str, **how: 
             {
                 "command": command,
                 "settings": {k: v for k, v in settings.to_dict().items() if k not in ("out", "name")},
-                "machine": json.loads((path / "machine.json").read_text()),
-                "summary": json.loads(summary.read_text()) if summary.exists() else UNFINISHED,
+                "machine": json.loads((path / "machine.json").read_text(encoding="utf-8")),
+                "summary": json.loads(summary.read_text(encoding="utf-8")) if summary.exists() else UNFINISHED,
             }
         )
     whole = facts[0]

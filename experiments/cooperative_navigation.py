@@ -7,7 +7,6 @@ a figure (curves.png), a comparison (table.md) and the machine and versions (mac
 
 import csv
 import dataclasses
-import json
 import sys
 import time
 from collections.abc import Sequence
@@ -22,7 +21,7 @@ from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option, others
 from matd3_jax.figures import style
 from matd3_jax.runs.paths import check_directory
-from matd3_jax.runtime import devices
+from matd3_jax.runtime import devices, files
 from matd3_jax.stats.intervals import compare, t_interval
 from matd3_jax.stats.text import plus_minus
 
@@ -73,7 +72,7 @@ def main(argv: Sequence[str]) -> int:
         "seconds": seconds,
         "settings": list(argv),
     }
-    (out / "machine.json").write_text(json.dumps(facts, indent=1) + "\n")
+    files.write_json(out / "machine.json", facts)
     report(out)
     return 0
 
@@ -109,8 +108,8 @@ def report(out: Path) -> None:
             cells.append(plus_minus(float(test.difference), float(test.high - test.low) / 2, "+.1f", ".1f"))
             lines.append(f"| {' | '.join(cells)} |")
     figure.axes[0].set_ylabel("training return, summed over agents")
-    figure.savefig(out / "curves.png", dpi=130)
-    (out / "table.md").write_text("\n".join(lines) + "\n")
+    style.save(figure, out / "curves.png", dpi=130)
+    files.write_text(out / "table.md", "\n".join(lines) + "\n")
     print("\n".join(lines))
 
 
@@ -127,7 +126,7 @@ def blocks(episode: np.ndarray, curves: np.ndarray, weights: np.ndarray) -> tupl
 
 
 def _ours(path: Path, algo: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if row["algo"] == algo]
     seeds = sorted({int(row["seed"]) for row in rows})
     by_seed = [[row for row in rows if int(row["seed"]) == seed] for seed in seeds]
@@ -147,14 +146,12 @@ def _authors(algo: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _write_curves(path: Path, metrics: dict[str, dict[str, np.ndarray]]) -> None:
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(("algo", "seed", "step", "episodes", "return"))
-        for algo, columns in metrics.items():
-            for i in range(columns["step"].shape[0]):
-                for k in range(columns["step"].shape[1]):
-                    cells = [columns[name][i, k] for name in ("seed", "step", "episodes")]
-                    writer.writerow((algo, *cells, f"{columns['return_agents'][i, k]:.4f}"))
+    rows: list[tuple[object, ...]] = [("algo", "seed", "step", "episodes", "return")]
+    for algo, columns in metrics.items():
+        for i, k in np.ndindex(columns["step"].shape):
+            cells = [columns[name][i, k] for name in ("seed", "step", "episodes")]
+            rows.append((algo, *cells, f"{columns['return_agents'][i, k]:.4f}"))
+    files.write_csv(path, rows)
 
 
 if __name__ == "__main__":

@@ -80,7 +80,7 @@ def point(axis: Axes, row: float, values: np.ndarray, color: str, offset: float 
 
 
 def save(figure: Figure, path: Path) -> None:
-    figure.savefig(path, dpi=130)
+    style.save(figure, path, dpi=130)
 
 
 def learning(axis: Axes, table: Table, name: str, color: str, label: str) -> None:

@@ -22,7 +22,7 @@ from matd3_jax.cli.options import Command, asks_for_help, key, option, others
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError
 from matd3_jax.runs.paths import check_directory
-from matd3_jax.runtime import devices
+from matd3_jax.runtime import devices, files
 from matd3_jax.sweep import runner
 from matd3_jax.sweep.runner import Stopped
 
@@ -159,7 +159,7 @@ def report(study: Study, data: Data, out: Path, options: StudyOptions) -> list[C
     lines = [f"# {study.title}", "", study.protocol, ""]
     lines += [*departures(study, data, options), *verdict.lines(claims), "", verdict.DEFINITIONS, ""]
     lines += [*study.details(data.table), "", f"![{study.title}]({study.figure})"]
-    (out / "table.md").write_text("\n".join(lines) + "\n")
+    files.write_text(out / "table.md", "\n".join(lines) + "\n")
     print("\n".join(lines[:-2]))
     return claims
 

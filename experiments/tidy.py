@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from matd3_jax.runtime import files
+
 INDEX = ("seed", "step", "updates", "episodes")
 WINDOW = 1000
 """Episodes in the means that the paper reports."""
@@ -149,19 +151,15 @@ def _last(values: np.ndarray) -> float:
 
 def write(table: Table, path: Path) -> None:
     """As CSV, numbers to six digits (whole ones in full)."""
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(table.columns)
-        writer.writerows(zip(*(_texts(column) for column in table.columns.values()), strict=True))
-    partial.replace(path)
+    rows = zip(*(_texts(column) for column in table.columns.values()), strict=True)
+    files.write_csv(path, [list(table.columns), *rows], line_end="\n")
 
 
 def read(path: Path) -> Table:
     """What `write` left; an empty table if there is no such file."""
     if not path.exists():
         return Table({})
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8") as file:
         header, *rows = csv.reader(file)
     return Table({name: _typed([row[i] for row in rows]) for i, name in enumerate(header)})
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from benchmarks.commit import commit
 from matd3_jax.errors import UserError
-from matd3_jax.runtime import devices
+from matd3_jax.runtime import devices, files
 
 Row = dict[str, Any]
 
@@ -29,7 +29,7 @@ class Report:
         self.out, self.file = out, out / "report.json"
         self.end = time.monotonic() + 60 * minutes
         facts = {"machine": devices.description(), "versions": devices.versions(), "commit": commit()}
-        before = json.loads(self.file.read_text()) if self.file.exists() else {}
+        before = json.loads(self.file.read_text(encoding="utf-8")) if self.file.exists() else {}
         self.facts: Row = facts
         self.parts: dict[str, dict[str, Row]] = before.get("parts", {})
         devices_before = before.get("machine", self.facts["machine"])["devices"]
@@ -73,9 +73,7 @@ class Report:
         return {name: row for name, row in self.parts.get(part, {}).items() if "failed" not in row}
 
     def save(self) -> None:
-        partial = self.file.with_suffix(".partial")
-        partial.write_text(json.dumps({**self.facts, "parts": self.parts}, indent=1) + "\n")
-        partial.replace(self.file)
+        files.write_json(self.file, {**self.facts, "parts": self.parts})
 
 
 def shown(row: Row) -> str:

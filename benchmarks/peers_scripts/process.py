@@ -12,6 +12,7 @@ from typing import Any
 
 from benchmarks.peers_scripts.rows import Worker
 from matd3_jax.cli import command
+from matd3_jax.runtime import files
 
 LIMIT = 900.0
 """Seconds for one answer; compiling included."""
@@ -123,7 +124,7 @@ def install(worker: Worker, folder: Path) -> str | None:
             error = last_line(done.stderr, "ERROR") or last_line(done.stdout) or f"code {done.returncode}"
             break
     record = {"requirements": [list(part) for part in worker.requirements], "error": error}
-    _record(worker, folder).write_text(json.dumps(record, indent=1) + "\n")
+    files.write_json(_record(worker, folder), record)
     return error
 
 

@@ -249,6 +249,7 @@ def fake_ffmpeg(tmp_path, monkeypatch):
         f"open({str(tmp_path / 'arguments')!r}, 'w').write(' '.join(sys.argv[1:]))\n"
         f"open({str(tmp_path / 'input')!r}, 'wb').write(sys.stdin.buffer.read())\n"
         "if 'broken' in sys.argv[-1]:\n    sys.exit('Unknown encoder')\n"
+        "open(sys.argv[-1], 'wb').write(b'film')\n"
     )
     program.chmod(program.stat().st_mode | stat.S_IEXEC)
     monkeypatch.setenv("PATH", str(program.parent))
@@ -261,7 +262,8 @@ def test_mp4_goes_through_ffmpeg_frame_by_frame(fake_ffmpeg):
     pixels = np.frombuffer((fake_ffmpeg / "input").read_bytes(), np.uint8).reshape(5, 31, 45, 3)
     np.testing.assert_array_equal(pixels, [np.asarray(frame) for frame in striped(5)])
     arguments = (fake_ffmpeg / "arguments").read_text()
-    assert "-s 45x31" in arguments and "-r 12" in arguments and arguments.endswith(str(fake_ffmpeg / "a.mp4"))
+    assert "-s 45x31" in arguments and "-r 12" in arguments and arguments.endswith(".mp4")
+    assert (fake_ffmpeg / "a.mp4").read_bytes() == b"film" and not list(fake_ffmpeg.glob(".*"))
     with pytest.raises(UserError, match="Unknown encoder"):
         encode.write(fake_ffmpeg / "broken.mp4", striped(1), fps=12)
 

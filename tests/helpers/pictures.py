@@ -8,16 +8,18 @@ import numpy as np
 from matplotlib.container import BarContainer
 from matplotlib.figure import Figure
 
+from matd3_jax.figures import style
+
 
 def written(monkeypatch) -> dict[Path, Figure]:
     """The figures that are written from now on, by their files."""
-    found, write = {}, Figure.savefig
+    found, write = {}, style.save
 
-    def savefig(figure, path, **options):
+    def save(figure, path, dpi):
         found[Path(path)] = figure
-        return write(figure, path, **options)
+        return write(figure, path, dpi)
 
-    monkeypatch.setattr(Figure, "savefig", savefig)
+    monkeypatch.setattr(style, "save", save)
     return found
 
 

@@ -22,6 +22,7 @@ from matd3_jax.runs import lock
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.training import checkpoint
 from matd3_jax.training.recording import Recorder
+from matd3_jax.training.session import TrainingSession
 
 SMALL = [
     "env=point_reach", "algo=iddpg", "seeds=2", "total_steps=1200", "learning_starts=400", "num_envs=4",
@@ -301,3 +302,41 @@ def test_a_signal_is_noted_while_something_is_printed(monkeypatch):
     finally:
         for name, handler in before.items():
             signal.signal(getattr(signal, name), handler)
+
+
+def test_a_checkpoint_that_was_whole_when_the_process_was_killed_gets_its_name(copy, whole):
+    """Killed before the rename; what is not whole is deleted."""
+    *_, last = checkpoint.steps(copy / "checkpoints")
+    (copy / "summary.json").unlink()
+    place = copy / "checkpoints"
+    (place / str(last)).rename(place / f".{last}.partial")
+    shutil.copytree(place / f".{last}.partial", place / ".9999.partial")
+    (place / ".9999.partial" / "checksums.json").unlink()
+    said = resume(copy)
+    assert any("has come to its end" in line for line in said)
+    assert not list(place.glob(".*"))
+    same(copy, whole)
+
+
+def test_a_checkpoint_that_is_written_again_is_there_until_its_successor_is(copy, whole, monkeypatch):
+    """Killed between the two names, the run has one of them."""
+    back_to(copy, checkpoint.steps(copy / "checkpoints")[1])
+    place, rename = copy / "checkpoints", type(copy).rename
+    kept = checkpoint.steps(place)[-1]
+
+    class Killed(BaseException):
+        pass
+
+    def killing(path, target):
+        if path.name == f".{kept}.partial":
+            raise Killed
+        return rename(path, target)
+
+    training = TrainingSession(config.load(SMALL))
+    state = checkpoint.restore(checkpoint.verify(place), training.trainer)
+    monkeypatch.setattr(type(copy), "rename", killing)
+    with pytest.raises(Killed):
+        checkpoint.save(place, kept, training.trainer, state, 9)
+    monkeypatch.setattr(type(copy), "rename", rename)
+    assert f"resumed from the checkpoint of env step {kept:,}" in resume(copy)
+    same(copy, whole)

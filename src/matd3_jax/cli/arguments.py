@@ -175,6 +175,19 @@ class Plot:
     each: bool = option("true: every seed, too, thin", default=False)
 
 
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """Say what a run directory holds, what of it is damaged, and how to go on with it. Changes nothing.
+
+    Exit code: 0 where nothing is damaged, 1 where something is and the run can be resumed, 2 where there is no run.
+    """
+
+    run: Path | None = option("the run directory", default=None, metavar="RUN_DIR", otherwise="none")
+    sweep: Path | None = option(
+        "the directory of a sweep, with its batches and runs", default=None, metavar="SWEEP_DIR", otherwise="none"
+    )
+
+
 # ---- the commands ----------------------------------------------------------------------------------------------------
 
 
@@ -233,6 +246,10 @@ PLOT = Command(
     _python("plot"), Plot,
     examples=("python -m matd3_jax.plot runs='runs/sweep/runs/*' y=return_agents,eval_return_agents average=iqm",),
 )  # fmt: skip
+CHECK = Command(
+    _python("check"), Check, usage=("run=RUN_DIR", "sweep=SWEEP_DIR"),
+    examples=("python -m matd3_jax.check run=runs/first", "python -m matd3_jax.check sweep=runs/sweep"),
+)  # fmt: skip
 
 COMMANDS: dict[str, Command] = {
     "train": TRAIN,
@@ -241,4 +258,5 @@ COMMANDS: dict[str, Command] = {
     "crossplay": CROSSPLAY,
     "plot": PLOT,
     "render": RENDER,
+    "check": CHECK,
 }

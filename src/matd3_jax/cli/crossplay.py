@@ -1,6 +1,5 @@
 """`python -m matd3_jax.crossplay runs=A,B,C`: every run's agents against every run's adversaries."""
 
-import csv
 import dataclasses
 import time
 from collections.abc import Sequence
@@ -187,24 +186,20 @@ def _words(mean: Mean | None, team: int) -> str:
 
 def _write(out: Path, pairings: Pairings, entrants: Sequence[Entrant], options: CrossPlay) -> None:
     names = [entrant.name for entrant in entrants]
-    with (out / "pairs.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        heading = ("agents", "agents_seed", "adversaries", "adversaries_seed", "pair")
-        writer.writerow((*heading, *(f"return_{team}" for team in TEAMS), "episodes"))
-        for runs, seeds, returns, own in zip(
-            pairings.runs, pairings.seeds, pairings.returns, pairings.own, strict=True
-        ):
-            who = [x for run, k in zip(runs, seeds, strict=True) for x in (names[run], entrants[run].settings.seed + k)]
-            writer.writerow((*who, _kind(own), *(f"{value:.9g}" for value in returns), options.episodes))
-    with (out / "means.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        columns = [name for team in TEAMS for name in (f"return_{team}", f"return_{team}_half_width")]
-        writer.writerow(("agents", "adversaries", "pair", "pairs", *columns))
-        for row in pairings.table():
-            who = ["all" if run is None else names[run] for run in (row.agents, row.adversaries)]
-            values = [f"{x:.9g}" for pair in zip(row.mean.value, row.mean.half, strict=True) for x in pair]
-            writer.writerow((*who, _kind(row.own), row.mean.pairs, *values))
-    runs = {
+    heading = ("agents", "agents_seed", "adversaries", "adversaries_seed", "pair")
+    pairs: list[Sequence[object]] = [(*heading, *(f"return_{team}" for team in TEAMS), "episodes")]
+    for runs, seeds, returns, own in zip(pairings.runs, pairings.seeds, pairings.returns, pairings.own, strict=True):
+        who = [x for run, k in zip(runs, seeds, strict=True) for x in (names[run], entrants[run].settings.seed + k)]
+        pairs.append((*who, _kind(own), *(f"{value:.9g}" for value in returns), options.episodes))
+    files.write_csv(out / "pairs.csv", pairs)
+    columns = [name for team in TEAMS for name in (f"return_{team}", f"return_{team}_half_width")]
+    means: list[Sequence[object]] = [("agents", "adversaries", "pair", "pairs", *columns)]
+    for row in pairings.table():
+        who = ["all" if run is None else names[run] for run in (row.agents, row.adversaries)]
+        values = [f"{x:.9g}" for pair in zip(row.mean.value, row.mean.half, strict=True) for x in pair]
+        means.append((*who, _kind(row.own), row.mean.pairs, *values))
+    files.write_csv(out / "means.csv", means)
+    entered = {
         e.name: {
             "path": str(e.path),
             "checkpoint": e.step,
@@ -215,9 +210,9 @@ def _write(out: Path, pairings: Pairings, entrants: Sequence[Entrant], options: 
         for e in entrants
     }
     chosen = {key: getattr(options, key) for key in ("pairing", "episodes", "deterministic", "seed")}
-    settings = {**chosen, "runs": runs}
-    environment = dict(entrants[0].settings.env)
-    files.write_json(out / "crossplay.json", {"env": environment, **settings, **devices.versions()})
+    settings = {**chosen, "runs": entered}
+    facts = {"env": dict(entrants[0].settings.env), **settings, **devices.versions()}
+    files.write_json(out / "crossplay.json", facts)
 
 
 def _kind(own: bool) -> str:

@@ -1,6 +1,5 @@
 """`python -m matd3_jax.evaluate run=RUN_DIR`: play whole episodes with the trained policies of every seed."""
 
-import csv
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,7 +9,7 @@ from matd3_jax.cli import arguments
 from matd3_jax.core.rollout import Evaluation
 from matd3_jax.runs import divergence
 from matd3_jax.runs.directory import RunDirectory
-from matd3_jax.runtime import devices
+from matd3_jax.runtime import devices, files
 from matd3_jax.runtime.terminal import show
 from matd3_jax.stats.intervals import mean_interval
 from matd3_jax.stats.text import plus_minus
@@ -55,10 +54,8 @@ def main(argv: Sequence[str]) -> int:
             ]
         table.add_section()
     show(table, 200)
-    with (run.path / "evaluation.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(("policy", "quantity", "seed", "mean", "std", "episodes", "diverged"))
-        writer.writerows(rows)
+    columns = ("policy", "quantity", "seed", "mean", "std", "episodes", "diverged")
+    files.write_csv(run.path / "evaluation.csv", [columns, *rows])
     return 0
 
 

@@ -13,6 +13,7 @@ COMMANDS = {
     "crossplay": "play every run's agents against every run's adversaries",
     "plot": "draw learning curves of runs",
     "render": "make a film of an episode",
+    "check": "say what a run directory holds and what is damaged",
 }
 
 HELP = "usage: matd3 COMMAND [key=value ...]\n\ncommands (matd3 COMMAND --help says more):\n" + "\n".join(

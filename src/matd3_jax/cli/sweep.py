@@ -77,11 +77,17 @@ def _plan(
     folder: Path, facts: Mapping[str, Any], settings: Mapping[str, Config], memory: float | None, processes: Processes
 ) -> None:
     """Make the sweep's directory, and say what is in it."""
-    RunDirectory.check_new(folder)
     sweep = Sweep(folder, processes)
-    runs = sweep.add(settings, None if memory is None else int(memory * 1e9))
-    facts = {**facts, "runs": {name: [path.name for path in paths] for name, paths in runs.items()}}
-    files.write_json(folder / "sweep.json", facts)
+    empty = folder.is_dir() and not any(folder.iterdir())  # a process was killed just as it had made it
+    if not empty and not sweep.unfinished_plan():
+        RunDirectory.check_new(folder)
+    with sweep.planning():
+        if (folder / "sweep.json").exists():  # another process was quicker
+            RunDirectory.check_new(folder)
+        sweep.discard_plan()
+        runs = sweep.add(settings, None if memory is None else int(memory * 1e9))
+        facts = {**facts, "runs": {name: [path.name for path in paths] for name, paths in runs.items()}}
+        files.write_json(folder / "sweep.json", facts)
     seeds = sum(c.seeds for c in settings.values())
     say(f"sweep directory: {folder}\n{len(settings)} settings, {seeds} seeds, {len(sweep.batches)} batches")
 
@@ -131,6 +137,10 @@ def open_sweep(folder: Path, processes: Processes = SINGLE_PROCESS) -> tuple[Swe
     try:
         return Sweep(folder, processes), json.loads((folder / "sweep.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
+        if Sweep(folder).unfinished_plan():
+            raise UserError(
+                f"{folder}: its planning was cut short; start the sweep again, with the same name="
+            ) from None
         raise UserError(f"{folder} is no sweep directory: it has no sweep.json") from None
 
 

@@ -12,6 +12,7 @@ from matplotlib.patches import Rectangle
 
 from matd3_jax.evaluation.cross_play import TEAMS
 from matd3_jax.evaluation.cross_play_table import Mean, Pairings
+from matd3_jax.figures import style
 from matd3_jax.stats.text import plus_minus
 
 
@@ -57,7 +58,7 @@ def draw(path: Path, names: Sequence[str], pairings: Pairings, title: str) -> No
         axis.spines[:].set_visible(False)
         figure.colorbar(image, ax=axis, fraction=0.05)
     figure.suptitle(f"{title}\nframed: a run against itself; own: trained together (same run, same seed)", fontsize=10)
-    figure.savefig(path, dpi=120)
+    style.save(figure, path, dpi=120)
 
 
 def text(mean: Mean, team: int) -> str:

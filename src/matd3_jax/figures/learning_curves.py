@@ -90,7 +90,7 @@ def compare(
             extent = legend.get_window_extent(figure.canvas.get_renderer())
             figure.set_size_inches(width + extent.width / figure.dpi, max(height, extent.height / figure.dpi + 0.2))
         try:
-            figure.savefig(path, dpi=200)
+            style.save(figure, path, dpi=200)
         except OSError as error:
             raise UserError(f"cannot write {path}: {error.strerror}") from error
 
@@ -133,4 +133,4 @@ def learning_curve(
         axis.legend(loc="lower right", frameon=False)
     axes[-1].set_xlabel("env steps of each seed")
     axes[0].set_title(title)
-    figure.savefig(path, dpi=120)
+    style.save(figure, path, dpi=120)

@@ -44,7 +44,7 @@ def draw(path: Path, metrics: Mapping[str, np.ndarray], teams: Mapping[str, Sequ
         for axis in (values, bias):
             axis.legend(frameon=False)
     figure.suptitle(f"{title}; {who}")
-    figure.savefig(path, dpi=120)
+    style.save(figure, path, dpi=120)
 
 
 def _line(axis, steps: np.ndarray, curves: np.ndarray, color: style.Color, label: str, dashes: str = "solid") -> None:

@@ -1,13 +1,16 @@
 """How figures look: colors to distinguish with any color vision (Okabe and Ito 2008), dashes, and curves with bands."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from matd3_jax.runtime import files
 from matd3_jax.stats.intervals import Estimate
 
 if TYPE_CHECKING:  # the films take colors from here, without matplotlib
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Color = tuple[int, int, int]
 """(red, green, blue), 0 to 255."""
@@ -53,6 +56,12 @@ PRINTED: dict[Any, Any] = {
     "svg.fonttype": "none",
 }
 """Sizes in points, for a picture that is printed at its own size; letters stay letters in PDF and SVG."""
+
+
+def save(figure: "Figure", path: Path, dpi: int) -> None:
+    """Write a figure to `path`, in the format of its suffix, whole or not at all. dpi: dots an inch of a picture."""
+    with files.replacing(path) as new:
+        figure.savefig(new, dpi=dpi)
 
 
 def dress(axis: "Axes") -> None:

@@ -37,7 +37,7 @@ def draw(path: Path, folder: Path, runs: Mapping[str, Sequence[str]], rows: Sequ
             _values(axis, key, rows, metric)
         for axis in axes[len(keys) :]:
             axis.set_visible(False)
-    figure.savefig(path, dpi=130)
+    style.save(figure, path, dpi=130)
 
 
 def _curves(axis, folder: Path, runs: Mapping[str, Sequence[str]], rows: Sequence[Ranked], metric: str) -> None:

@@ -1,5 +1,6 @@
 """The run directory: settings, versions, the metrics table, checkpoints and pictures of one run."""
 
+import errno
 import itertools
 import json
 import os
@@ -19,6 +20,9 @@ from matd3_jax.runs import metrics_table
 from matd3_jax.runs.metrics_table import MetricsTable
 from matd3_jax.runs.paths import check_directory
 from matd3_jax.runtime import files
+
+FORMAT = 1
+"""Of what a run directory holds, in its machine.json; directories without it are of format 0, and are read, too."""
 
 
 class RunDirectory:
@@ -50,37 +54,92 @@ class RunDirectory:
 
     @classmethod
     def create(cls, path: Path, config: Config, machine: Mapping[str, Any], or_another: bool = False) -> "RunDirectory":
-        """Make the directory, or with `or_another` the first of PATH, PATH-2, PATH-3, ... that is not there yet, even
-        while others do the same. Raises UserError if it is there already or cannot be made."""
-        for tried in (path if k == 1 else path.with_name(f"{path.name}-{k}") for k in itertools.count(1)):
-            try:
-                tried.mkdir(parents=True)
-            except FileExistsError:
+        """Make the directory, which gets its name with its settings in it: a kill leaves none without.
+
+        Args:
+            or_another: make the first of PATH, PATH-2, PATH-3, ... that is not there yet, even while others do the
+                same.
+
+        Raises UserError if it is there already or cannot be made.
+        """
+        new = path.with_name(f".run.{os.getpid()}.partial")
+        try:
+            shutil.rmtree(new, ignore_errors=True)
+            new.mkdir(parents=True)
+            configuration.write(config, new / "config.yaml")
+            files.write_json(new / "machine.json", {"format": FORMAT, **machine})
+            for number in itertools.count(1):
+                tried = path if number == 1 else path.with_name(f"{path.name}-{number}")
+                if not os.path.lexists(tried):
+                    try:
+                        new.rename(tried)
+                    except OSError as error:
+                        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
+                            raise  # else another process was quicker
+                    else:
+                        files.sync_folder(path.parent)
+                        return cls(tried)
                 if not or_another:
-                    raise UserError(_there(path)) from None
-            except OSError as error:
-                raise UserError(f"cannot make the run directory {path}: {error.strerror}") from error
-            else:
-                path = tried
-                break
-        run = cls(path)
-        configuration.write(config, path / "config.yaml")
-        files.write_json(path / "machine.json", machine)
-        return run
+                    raise UserError(_there(path))
+        except OSError as error:
+            raise UserError(f"cannot make the run directory {path}: {error.strerror}") from error
+        finally:
+            shutil.rmtree(new, ignore_errors=True)
+        raise AssertionError("counting ends nowhere")
 
     @classmethod
     def open(cls, path: Path) -> tuple["RunDirectory", Config]:
-        """An existing run and its settings. Raises UserError if there is none."""
+        """An existing run and its settings. Raises UserError if there is none, or one of a newer format."""
         if not path.is_dir():
             raise UserError(f"there is no run directory {path}")
         if not (path / "config.yaml").is_file():
             raise UserError(f"{path} is no run directory: it has no config.yaml")
-        return cls(path), configuration.read(path / "config.yaml")
+        run = cls(path)
+        if run.format > FORMAT:
+            raise UserError(
+                f"{path} has the format {run.format} of run directories, this version reads up to {FORMAT}: "
+                "use the version of matd3_jax that wrote it, or a newer one"
+            )
+        return run, configuration.read(path / "config.yaml")
+
+    @property
+    def format(self) -> int:
+        """Of what the directory holds: 0 where machine.json does not say."""
+        try:
+            found = json.loads((self.path / "machine.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError):
+            return 0
+        number = found.get("format", 0) if isinstance(found, dict) else 0
+        return number if isinstance(number, int) else 0
+
+    @property
+    def bare(self) -> bool:
+        """Whether the directory was made, and nothing has been trained in it."""
+        if self.path.is_symlink() or not self.path.is_dir():
+            return False
+        own = {"config.yaml", "machine.json", *(left.name for left in files.partial(self.path))}
+        return {found.name for found in self.path.iterdir()} <= own
+
+    def clean(self) -> None:
+        """Take away what killed writes left beside the files, while the lock of the directory is held.
+
+        Raises UserError where what is written in place is a link: what is behind it is not the run's.
+        """
+        for path in (self.metrics, self.checkpoints, self.tensorboard):
+            if path.is_symlink():
+                raise UserError(f"{path} is a link: nothing is written through it")
+        files.remove_partial(self.path)
 
     def append(self, row: Mapping[str, np.ndarray]) -> None:
         """Add one row for each seed to the metrics table. row: columns [seeds], the same ones every time."""
         new = not self.metrics.exists() or not self.metrics.stat().st_size
         files.append_text(self.metrics, metrics_table.row_lines(row, header=new))
+
+    def sync(self) -> None:
+        """Bring the metrics table to the disk, before a checkpoint that has its rows behind it gets its name."""
+        if self.metrics.exists():
+            files.sync(self.metrics)
+            files.sync_folder(self.path)
 
     def clear(self) -> None:
         """Take away all but settings and machine: the run begins anew."""

@@ -18,6 +18,10 @@ except ImportError:  # not on every system
 NAME = ".lock"
 
 
+class InUse(UserError):
+    """Another process holds the lock."""
+
+
 @contextlib.contextmanager
 def held(folder: Path) -> Iterator[None]:
     """Hold the lock of a directory for the block.
@@ -25,10 +29,26 @@ def held(folder: Path) -> Iterator[None]:
     The system lets go of it when the process ends, however that comes about: what a killed process left is taken over.
     Where the system has no such locks, the file names its owner, and is taken over when that process is gone.
 
-    Raises UserError where another process holds it; the message says which.
+    Raises InUse where another process holds it; the message says which.
     """
     with (_by_system if fcntl is not None else _by_owner)(folder / NAME):
         yield
+
+
+def holder(folder: Path) -> str | None:
+    """Who works in a directory, in words; None: nobody. Nothing is changed."""
+    path = folder / NAME
+    if path.is_symlink() or not path.is_file():
+        return None
+    if fcntl is None:
+        written = path.read_text(errors="replace")
+        return None if _gone(written) else _who(written)
+    with path.open(encoding="utf-8", errors="replace") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except OSError:
+            return _who(file.read())
+    return None
 
 
 @contextlib.contextmanager
@@ -80,13 +100,16 @@ def _owner() -> str:
     return json.dumps({"process": os.getpid(), "host": socket.gethostname()}) + "\n"
 
 
-def _taken(path: Path, written: str) -> UserError:
+def _taken(path: Path, written: str) -> InUse:
+    return InUse(f"{path.parent} is in use: {_who(written)} works in it; wait for its end, or stop it")
+
+
+def _who(written: str) -> str:
     try:
         owner = json.loads(written)
-        who = f"process {int(owner['process'])} on {owner['host']}"
+        return f"process {int(owner['process'])} on {owner['host']}"
     except (ValueError, KeyError, TypeError):
-        who = "another process"
-    return UserError(f"{path.parent} is in use: {who} works in it; wait for its end, or stop it")
+        return "another process"
 
 
 def _gone(written: str) -> bool:

@@ -28,6 +28,11 @@ def paths(texts: Sequence[str], key: str = "runs") -> tuple[Path, ...]:
     return tuple(found)
 
 
+def is_name(value: object) -> bool:
+    """Whether a value from a file can be the name of a directory in another: one part of a path, that leads nowhere."""
+    return isinstance(value, str) and value == Path(value).name and value not in ("", "..") and not {*value} & {*"\\\0"}
+
+
 def check_new_directory(path: Path, key: str) -> None:
     """`check_directory`, and raise UserError where something is in it already."""
     check_directory(path, key)

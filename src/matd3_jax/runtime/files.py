@@ -1,15 +1,21 @@
 """Write files whole or not at all: what is replaced stays as it was until its successor is on the disk."""
 
 import contextlib
+import csv
 import errno
+import io
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from matd3_jax.errors import UserError
+
+PARTIAL = re.compile(r"\..+\.\d+\.partial(\.\w+)?")
+"""Names of the files that `replacing` writes beside those that they replace."""
 
 
 @contextlib.contextmanager
@@ -23,11 +29,22 @@ def replacing(path: Path) -> Iterator[Path]:
     partial.unlink(missing_ok=True)
     try:
         yield partial
-        _sync(partial)
+        sync(partial)
         os.replace(partial, path)
         sync_folder(path.parent)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def partial(folder: Path) -> list[Path]:
+    """Files in a folder that `replacing` began and a kill left."""
+    return sorted(path for path in folder.glob(".*.partial*") if PARTIAL.fullmatch(path.name) and not path.is_dir())
+
+
+def remove_partial(folder: Path) -> None:
+    """Delete what `partial` finds; nobody else may write there now."""
+    for path in partial(folder):
+        path.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -43,6 +60,13 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Write a value as JSON that every reader takes: numbers that are not finite are null."""
     write_text(path, json.dumps(_finite(value), indent=1, allow_nan=False) + "\n")
+
+
+def write_csv(path: Path, rows: Iterable[Sequence[Any]], line_end: str = "\r\n") -> None:
+    """Write rows, the names of the columns first, as CSV."""
+    file = io.StringIO(newline="")
+    csv.writer(file, lineterminator=line_end).writerows(rows)
+    write_text(path, file.getvalue())
 
 
 def append_text(path: Path, text: str) -> None:
@@ -79,7 +103,8 @@ def sync_folder(folder: Path) -> None:
             os.close(handle)
 
 
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Bring what was written to a file to the disk."""
     handle = os.open(path, os.O_RDWR)
     try:
         os.fsync(handle)

@@ -1,6 +1,5 @@
 """The settings of a sweep, ranked by their final returns."""
 
-import csv
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,7 +10,7 @@ from rich.table import Table
 from matd3_jax.errors import UserError, nearest
 from matd3_jax.runs import divergence
 from matd3_jax.runs.directory import RunDirectory
-from matd3_jax.runtime import terminal
+from matd3_jax.runtime import files, terminal
 from matd3_jax.stats.intervals import mean_interval
 from matd3_jax.stats.text import plus_minus
 
@@ -96,20 +95,16 @@ def show(rows: Sequence[Ranked], title: str, most: int = 30) -> None:
 def write(folder: Path, rows: Sequence[Ranked]) -> None:
     """Leave table.csv (a row each setting) and seeds.csv (a row each setting and seed)."""
     keys = list(rows[0].values)
-    with (folder / "table.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        intervals = ("final_mean", "final_interval", "area_mean", "area_interval")
-        writer.writerow(("rank", "setting", *keys, "seeds", "diverged", *intervals))
-        for k, row in enumerate(rows):
-            numbers = [f"{x:.6g}" for which in ("final", "area") for x in row.interval(which)]
-            writer.writerow((k + 1, row.name, *row.values.values(), len(row.seeds), row.diverged.sum(), *numbers))
-    with (folder / "seeds.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(("rank", "setting", *keys, "seed", "diverged", "final", "area"))
-        for k, row in enumerate(rows):
-            for seed, diverged, final, area in zip(row.seeds, row.diverged, row.final, row.area, strict=True):
-                numbers = [f"{final:.6g}", f"{area:.6g}"]
-                writer.writerow((k + 1, row.name, *row.values.values(), seed, int(diverged), *numbers))
+    intervals = ("final_mean", "final_interval", "area_mean", "area_interval")
+    table: list[Sequence[object]] = [("rank", "setting", *keys, "seeds", "diverged", *intervals)]
+    seeds: list[Sequence[object]] = [("rank", "setting", *keys, "seed", "diverged", "final", "area")]
+    for k, row in enumerate(rows):
+        numbers = [f"{x:.6g}" for which in ("final", "area") for x in row.interval(which)]
+        table.append((k + 1, row.name, *row.values.values(), len(row.seeds), row.diverged.sum(), *numbers))
+        for seed, diverged, final, area in zip(row.seeds, row.diverged, row.final, row.area, strict=True):
+            seeds.append((k + 1, row.name, *row.values.values(), seed, int(diverged), f"{final:.6g}", f"{area:.6g}"))
+    files.write_csv(folder / "table.csv", table)
+    files.write_csv(folder / "seeds.csv", seeds)
 
 
 def _mean(values: np.ndarray) -> float:

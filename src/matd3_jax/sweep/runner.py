@@ -5,7 +5,6 @@ and, while a batch is trained, `batches/K/` with its checkpoints. Each batch can
 """
 
 import contextlib
-import fcntl
 import json
 import shutil
 import time
@@ -17,8 +16,9 @@ import numpy as np
 
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError
-from matd3_jax.runs import divergence
+from matd3_jax.runs import divergence, lock
 from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.runs.paths import is_name
 from matd3_jax.runtime import devices, files
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
@@ -50,8 +50,50 @@ class Sweep:
 
     @property
     def batches(self) -> list[list[str]]:
-        """Names of the runs in each batch."""
-        return json.loads(self._plan.read_text(encoding="utf-8")) if self._plan.exists() else []
+        """Names of the runs in each batch. Raises UserError where the file has something else."""
+        if not self._plan.exists():
+            return []
+        try:
+            found = json.loads(self._plan.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError) as error:
+            raise UserError(f"cannot read {self._plan}: {error}") from error
+        if not isinstance(found, list) or not all(isinstance(batch, list) and batch for batch in found):
+            raise UserError(f"{self._plan}: must be a list of batches, each a list of names of runs")
+        for name in (name for batch in found for name in batch):
+            if not is_name(name):
+                raise UserError(f"{self._plan}: {name!r} is no name of a run in {self.runs}")
+        return found
+
+    @contextlib.contextmanager
+    def planning(self) -> Iterator[None]:
+        """Have the folder, which is made, to oneself for the block. Where the block fails at once nothing is left.
+
+        Raises InUse where another process plans.
+        """
+        made = [path for path in (self.folder, *self.folder.parents) if not path.exists()]
+        self.folder.mkdir(parents=True, exist_ok=True)
+        try:
+            with lock.held(self.folder):
+                yield
+        except UserError:
+            if made and [path.name for path in self.folder.iterdir()] == [lock.NAME]:
+                (self.folder / lock.NAME).unlink()
+                for path in made:
+                    path.rmdir()
+            raise
+
+    def unfinished_plan(self) -> bool:
+        """Whether the folder has no more than what a process that was killed while it planned leaves."""
+        if not self.folder.is_dir() or not all(RunDirectory(path).bare for path in _entries(self.runs)):
+            return False
+        own = {lock.NAME, self.runs.name, self._plan.name, *(path.name for path in files.partial(self.folder))}
+        return set() < {path.name for path in self.folder.iterdir()} <= own
+
+    def discard_plan(self) -> None:
+        """Take away what `unfinished_plan` found, while the folder is held."""
+        if self.unfinished_plan():
+            files.remove_partial(self.folder)
+            self._plan.unlink(missing_ok=True)
 
     def add(self, settings: Mapping[str, Config], budget: int | None = None) -> dict[str, list[Path]]:
         """Plan what is missing of `settings` (by name): the directories of each setting's runs, those already there
@@ -62,6 +104,10 @@ class Sweep:
 
         Raises UserError where a setting is impossible, or one seed of it does not fit.
         """
+        planned = {name for batch in self.batches for name in batch}
+        for path in _entries(self.runs):
+            if path.name not in planned and RunDirectory(path).bare:  # a process was killed while it planned
+                shutil.rmtree(path)
         if any(config.tensorboard for config in settings.values()):
             TensorBoardLogger.check()
         if any(config.on_divergence != "continue" for config in settings.values()):
@@ -93,6 +139,9 @@ class Sweep:
         Batches that another process trains are skipped.
         """
         stop = Stop()
+        if self.processes.first:
+            self._check_links()
+            self._clean()
         todo = [k for k in range(len(self.batches)) if not self.finished(k) and (only is None or k in only)]
         for k in self.processes.broadcast(todo):
             with self._taken(k) as mine:
@@ -117,16 +166,29 @@ class Sweep:
             return
         folder = self.folder_of(batch)
         folder.mkdir(parents=True, exist_ok=True)
-        with (folder / "lock").open("w", encoding="utf-8") as lock:
+        with contextlib.ExitStack() as stack:
             try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
+                stack.enter_context(lock.held(folder))
+            except lock.InUse:
                 say(f"batch {batch}: another process trains it, skipped")
                 yield False
                 return
             yield True
-        if self.finished(batch):
-            shutil.rmtree(folder, ignore_errors=True)
+        self._clean()
+
+    def _check_links(self) -> None:
+        """Raise UserError where a folder that is written to, or deleted, is a link to elsewhere."""
+        batches = range(len(self.batches))
+        names = [self.runs / name for k in batches if not self.finished(k) for name in self.batches[k]]
+        for path in (*names, self.folder / self._name, *map(self.folder_of, batches)):
+            if not path.resolve().is_relative_to(self.folder.resolve()):
+                raise UserError(f"{path} leads out of {self.folder}: nothing is written there")
+
+    def _clean(self) -> None:
+        """Delete what finished batches needed while they were trained."""
+        for k in range(len(self.batches)):
+            if self.folder_of(k).is_dir() and self.finished(k):
+                shutil.rmtree(self.folder_of(k), ignore_errors=True)
 
 
 class Batch:
@@ -154,7 +216,7 @@ class Batch:
         training.check_memory(recorded=True)
         if self.processes.first:
             self._announce()
-        state, row = self._begin()
+        state, row, fresh = self._begin()
         loggers: list[Logger] = []
         if self.processes.first:
             progress = ProgressBar(training, row, self.watch.diverged)
@@ -163,17 +225,25 @@ class Batch:
                 loggers.append(TensorBoardLogger(self.runs, self.seeds))
 
         def save(state: TrainState, step: int) -> None:
+            for run in self.runs if self.processes.first else ():
+                run.sync()
             checkpoint.save(self.checkpoints, step, training.trainer, state, keep=1, share=training.share)
 
-        outcome = training_run.run(training, state, row, loggers, save, stop)
+        outcome = training_run.run(training, state, row, loggers, save, stop, save_first=fresh)
         if outcome.stopped is not None:
             save(outcome.state, int(outcome.row["step"][0]))
             return
         rates = progress.rates() if self.processes.first else {}
         self._finish(outcome.state, outcome.row, {"seconds": round(time.monotonic() - begun, 1), **rates})
 
-    def _begin(self) -> tuple[TrainState, Row]:
+    def _begin(self) -> tuple[TrainState, Row, bool]:
+        """The state to go on from, its row, and whether nothing was trained yet."""
         first, broadcast = self.processes.first, self.processes.broadcast
+        for run in self.runs if first else ():
+            run.clean()
+            checkpoint.recover(run.checkpoints)
+        if first:
+            checkpoint.recover(self.checkpoints)
         if not broadcast(bool(checkpoint.steps(self.checkpoints)) if first else None):
             for run in self.runs if first else ():
                 run.clear()
@@ -181,7 +251,7 @@ class Batch:
             if first:
                 self.table.log(row)
                 self.watch.log(row)
-            return state, row
+            return state, row, True
         saved = Path(broadcast(str(checkpoint.verify(self.checkpoints)) if first else None))
         state, done = checkpoint.restore(saved, self.training.trainer, self.training.share), int(saved.name)
         self.processes.barrier()
@@ -192,7 +262,7 @@ class Batch:
         if first:
             say(f"resuming from the checkpoint of env step {done:,}")
         updates = self.training.trainer.updates(int(state.rollouts))
-        return state, {"step": np.array([done]), "updates": np.array([updates])}
+        return state, {"step": np.array([done]), "updates": np.array([updates])}, False
 
     def _finish(self, state: TrainState, row: Row, facts: Mapping[str, Any]) -> None:
         """Leave each run as if it had been trained alone, but for its replay."""
@@ -221,6 +291,10 @@ class Batch:
               f"{needed(training.trainer, len(training.seeds)) / 1e9:.2f} GB in all")  # fmt: skip
 
 
+def _entries(folder: Path) -> list[Path]:
+    return sorted(folder.iterdir()) if folder.is_dir() and not folder.is_symlink() else []
+
+
 class Stopped(Exception):
     """A signal ended the training; `code` is the exit code."""
 
@@ -235,7 +309,8 @@ def train(settings: Mapping[str, Config], folder: Path, budget: int | None = Non
     Raises UserError, and Stopped when a signal ended the training.
     """
     sweep = Sweep(folder)
-    runs = sweep.add(settings, budget)
+    with sweep.planning():
+        runs = sweep.add(settings, budget)
     wanted = [path for paths in runs.values() for path in paths]
     names = {path.name for path in wanted}
     code = sweep.train([k for k, batch in enumerate(sweep.batches) if names & set(batch)])

@@ -84,7 +84,10 @@ def save(
     if processes.first:
         checksums = dict(sorted(pair for part in parts for pair in json.loads(part).items()))
         files.write_json(partial_ / "checksums.json", checksums)
-        _remove(final)
+        if final.is_symlink():
+            _remove(final)
+        elif final.exists():  # kept until its successor has its name
+            _aside(final)
         partial_.rename(final)
         files.sync_folder(folder)
         for old in steps(folder)[:-keep]:
@@ -109,9 +112,26 @@ def set_aside_after(folder: Path, step: int) -> None:
     """
     for later in steps(folder):
         if later > step:
-            aside = folder / f"{later}{ASIDE}"
-            shutil.rmtree(aside, ignore_errors=True)
-            (folder / str(later)).rename(aside)
+            _aside(folder / str(later))
+
+
+def _aside(path: Path) -> None:
+    aside = path.with_name(f"{path.name}{ASIDE}")
+    shutil.rmtree(aside, ignore_errors=True)
+    path.rename(aside)
+
+
+def recover(folder: Path) -> None:
+    """Give a checkpoint that was whole when the process was killed its name, and delete what is not whole.
+
+    Nobody else may work in `folder` now.
+    """
+    for left in folder.glob(".*.partial"):
+        final = folder / left.name.removeprefix(".").removesuffix(".partial")
+        if not final.exists() and final.name.isdigit() and damage(left) is None:
+            left.rename(final)
+        else:
+            shutil.rmtree(left, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -144,18 +164,23 @@ def verify(folder: Path, step: int | None = None) -> Path:
     if step not in found:
         raise UserError(f"{folder} holds no checkpoint of step {step}; there: {', '.join(map(str, found))}")
     path = folder.resolve() / str(step)
-    try:
-        wanted = json.loads((path / "checksums.json").read_text(encoding="utf-8"))
-        damaged = next((name for name, digest in wanted.items() if _digest(path / name) != digest), None)
-    except FileNotFoundError as error:
-        damaged = f"{Path(str(error.filename)).relative_to(path)} is missing"
-    except (OSError, ValueError, AttributeError):
-        damaged = "checksums.json"
+    damaged = damage(path)
     if damaged is not None:
         before = [other for other in found if other < step]
         hint = f"resume from the one before it with checkpoint={before[-1]}" if before else "there is none before it"
         raise UserError(f"the checkpoint {folder / str(step)} is damaged ({damaged}); {hint}")
     return path
+
+
+def damage(path: Path) -> str | None:
+    """What is damaged or missing of the checkpoint at `path`; None where it is whole."""
+    try:
+        wanted = json.loads((path / "checksums.json").read_text(encoding="utf-8"))
+        return next((name for name, digest in wanted.items() if _digest(path / name) != digest), None)
+    except FileNotFoundError as error:
+        return f"{Path(str(error.filename)).relative_to(path)} is missing"
+    except (OSError, ValueError, AttributeError):
+        return "checksums.json"
 
 
 def restore(path: Path, trainer: TrainLoop, share: Share | None = None) -> TrainState:

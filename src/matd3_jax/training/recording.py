@@ -130,6 +130,9 @@ class Recorder:
     def _held(self, directory: RunDirectory) -> Iterator[None]:
         """The directory's lock, which the first process holds for all."""
         with lock.held(directory.path) if self.processes.first else contextlib.nullcontext():
+            if self.processes.first:
+                directory.clean()
+                checkpoint.recover(directory.checkpoints)
             yield
 
     def _from_the_start(self, training: TrainingSession, directory: RunDirectory, stop: Stop | None) -> Recorded:
@@ -232,6 +235,8 @@ class Recorder:
 
         def save(state: TrainState, step: int) -> None:
             keep = settings.keep_checkpoints
+            if self.processes.first:
+                directory.sync()
             checkpoint.save(directory.checkpoints, step, training.trainer, state, keep, share=training.share)
 
         outcome = run(training, state, row, loggers, save, stop, save_first=fresh)

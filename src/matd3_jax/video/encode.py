@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image
 
 from matd3_jax.errors import UserError
+from matd3_jax.runtime import files
 
 LAST_FRAME_SECONDS = 1.0
 """How much longer a GIF shows its last frame, before it starts anew."""
@@ -39,10 +40,11 @@ def write(path: Path, frames: Sequence[Image.Image], fps: float, colors: int = 6
     """
     check(path, fps)
     try:
-        if path.suffix == ".gif":
-            _write_gif(path, frames, fps, colors)
-        else:
-            _write_mp4(path, frames, fps)
+        with files.replacing(path) as new:
+            if path.suffix == ".gif":
+                _write_gif(new, frames, fps, colors)
+            else:
+                _write_mp4(new, frames, fps)
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror or error}") from error
 
@@ -80,4 +82,4 @@ def _write_mp4(path: Path, frames: Sequence[Image.Image], fps: float) -> None:
     done = subprocess.run(command, input=data, stderr=subprocess.PIPE, check=False)
     if done.returncode:
         lines = done.stderr.decode(errors="replace").strip().splitlines() or ["no message"]
-        raise UserError(f"ffmpeg could not write {path}: {lines[-1]}")
+        raise UserError(f"ffmpeg could not write the film: {lines[-1]}")

@@ -1,0 +1,74 @@
+"""Run directories have a format, know what a killed write left, and are not written through links."""
+
+import json
+
+import pytest
+
+from matd3_jax import config
+from matd3_jax.cli import command
+from matd3_jax.errors import UserError
+from matd3_jax.runs.directory import FORMAT, RunDirectory
+from matd3_jax.runs.paths import is_name
+from matd3_jax.runtime import files
+
+SMALL = ["env=point_reach", "total_steps=400", "learning_starts=100", "replay_capacity=400", "batch_size=8"]
+
+
+@pytest.fixture
+def run(tmp_path):
+    return RunDirectory.create(tmp_path / "run", config.load(SMALL), {"versions": {}})
+
+
+def test_a_new_directory_has_the_format_of_this_version(run):
+    assert json.loads((run.path / "machine.json").read_text())["format"] == FORMAT == run.format == 1
+
+
+@pytest.mark.parametrize("written", ['{"versions": {}}', "", "[1]", '{"format": "x"}', None])
+def test_without_a_format_it_is_read_as_before(run, written):
+    machine = run.path / "machine.json"
+    machine.unlink() if written is None else machine.write_text(written)
+    opened, settings = RunDirectory.open(run.path)
+    assert opened.format == 0 and settings == config.load(SMALL)
+
+
+@pytest.mark.parametrize(
+    "name, key",
+    [
+        ("train", "resume"),
+        ("evaluate", "run"),
+        ("render", "run"),
+        ("plot", "runs"),
+        ("crossplay", "runs"),
+        ("check", "run"),
+    ],
+)
+def test_every_command_refuses_a_newer_format_in_one_line(run, name, key, tmp_path):
+    files.write_json(run.path / "machine.json", {"format": FORMAT + 1})
+    before = {path: path.read_bytes() for path in run.path.iterdir()}
+    out = {"crossplay": [f"out={tmp_path / 'out'}"], "plot": [f"out={tmp_path / 'plot.png'}"]}
+    with pytest.raises(UserError, match=f"has the format {FORMAT + 1} of run directories, this version") as found:
+        command.start(name, [f"{key}={run.path}", *out.get(name, [])])
+    assert "\n" not in str(found.value)
+    assert {path: path.read_bytes() for path in run.path.iterdir()} == before
+
+
+def test_what_killed_writes_left_is_removed_and_nothing_else(run):
+    left = [".config.123.partial.yaml", ".learning_curve.9.partial.png", ".lock.1.partial"]
+    kept = [".config.partial.yaml", ".hidden", "a.1.partial", ".config.x.partial.yaml"]
+    for name in left + kept:
+        (run.path / name).write_text("")
+    assert [path.name for path in files.partial(run.path)] == sorted(left)
+    run.clean()
+    assert {path.name for path in run.path.iterdir()} == {*kept, "config.yaml", "machine.json"}
+
+
+@pytest.mark.parametrize("name", ["metrics.csv", "checkpoints", "tensorboard"])
+def test_links_are_not_written_through(run, name, tmp_path):
+    (run.path / name).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(UserError, match="is a link: nothing is written through it"):
+        run.clean()
+
+
+def test_names_are_one_part_of_a_path():
+    assert all(map(is_name, ["a", "lr_0.1", "...", "é", "a b"]))
+    assert not any(map(is_name, ["", ".", "..", "a/", "/a", "a/b", "a\\b", "a\0", None, 3, ["a"]]))
