@@ -263,6 +263,7 @@ def test_a_launcher_trains_nothing_that_is_finished(swept, capfd):
         (["algo.lr=1,2", "train=maybe"], "train=maybe"),
         (["algo.lr=1,2", "metric=return_agnets"], "did you mean 'return_agents'"),
         (["algo.lr=1,2", "bach=3"], "did you mean 'batch'"),
+        (["algo.lr=1,2", "on_divergence=stop"], "on_divergence=stop: a sweep"),
         (["algo.lr=1,2", "batch=0"], "batch= goes with resume="),
         (["algo.lr=1,2", "launcher=submitti"], "no launcher is called 'submitti'"),
         (["algo.lr=1,2", "launcher.partition=gpu"], "say which launcher"),
