@@ -118,7 +118,9 @@ def read(path: Path) -> Config:
     """The configuration that `write` left. Raises UserError if it cannot be read."""
     try:
         found = OmegaConf.to_container(OmegaConf.load(path))
-        assert isinstance(found, dict)
+        assert isinstance(found, dict) and isinstance(found.get("env"), dict), (
+            "it has no settings of an environment, env:"
+        )
         values = _with_defaults(renamed(found), ADDED_LATER)
         if "physics" in values["env"]:
             from matd3_jax.envs.robots.engines.engine import RENAMED
