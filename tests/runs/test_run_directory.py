@@ -72,3 +72,11 @@ def test_links_are_not_written_through(run, name, tmp_path):
 def test_names_are_one_part_of_a_path():
     assert all(map(is_name, ["a", "lr_0.1", "...", "é", "a b"]))
     assert not any(map(is_name, ["", ".", "..", "a/", "/a", "a/b", "a\\b", "a\0", None, 3, ["a"]]))
+
+
+@pytest.mark.parametrize("text", ["", "env: [", "[]", "a: b: c", "env:\n  name: x\n  epi", "\0"])
+def test_settings_that_cannot_be_read_are_refused_in_one_line(run, text):
+    (run.path / "config.yaml").write_text(text)
+    with pytest.raises(UserError, match="cannot read the configuration") as found:
+        RunDirectory.open(run.path)
+    assert "\n" not in str(found.value)
