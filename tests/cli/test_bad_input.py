@@ -60,6 +60,11 @@ def refused(main, argv: list[str], key: str, capsys) -> str | None:
     return f"{shown!r}: leaves {left[0]}" if left else None
 
 
+def tell(capsys, what: str, count: int) -> None:
+    with capsys.disabled():
+        print(f"{what}: {count} inputs refused")
+
+
 def others() -> Iterator[Command]:
     """The commands of benchmarks and experiments."""
     for package in (benchmarks, experiments):
@@ -90,7 +95,7 @@ def needed(one: Command, key: str) -> list[str]:
 
 
 @pytest.mark.parametrize("name", arguments.COMMANDS)
-def test_options_of_commands(name, capsys, record_property):
+def test_options_of_commands(name, capsys):
     one = arguments.COMMANDS[name]
     found = list(cases(one))
     wrong = [
@@ -98,10 +103,10 @@ def test_options_of_commands(name, capsys, record_property):
         for key, text in found
     ]
     assert not [line for line in wrong if line]
-    record_property("inputs", len(found))
+    tell(capsys, name, len(found))
 
 
-def test_options_of_benchmarks_and_experiments(capsys, record_property):
+def test_options_of_benchmarks_and_experiments(capsys):
     count, commands, wrong = 0, list(others()), []
     for one in commands:
         for key, text in cases(one):
@@ -113,8 +118,7 @@ def test_options_of_benchmarks_and_experiments(capsys, record_property):
             )
     assert len(commands) >= 10 and count > 500
     assert not [line for line in wrong if line]
-    record_property("inputs", count)
-    record_property("commands", len(commands))
+    tell(capsys, f"{len(commands)} commands of benchmarks and experiments", count)
 
 
 def of_schema(cls: type, prefix: str) -> Iterator[tuple[str, str]]:
@@ -136,14 +140,14 @@ GROUPS = {
 
 
 @pytest.mark.parametrize("prefix", GROUPS)
-def test_settings(prefix, capsys, record_property):
+def test_settings(prefix, capsys):
     cls, more = GROUPS[prefix]
     found = list(of_schema(cls, prefix))
     wrong = [
         refused(lambda argv: command.start("train", argv), [*more, f"{key}={text}"], key, capsys) for key, text in found
     ]
     assert not [line for line in wrong if line]
-    record_property("inputs", len(found))
+    tell(capsys, f"{prefix}SETTING", len(found))
 
 
 @pytest.mark.parametrize(

@@ -53,7 +53,7 @@ def options(hint: Any, metadata: Mapping[str, Any]) -> Iterator[str]:
     elif bounds.choices is not None:
         yield from NO_CHOICE
     elif kind is Path and not several:
-        yield ""
+        yield from ("", "/no/such/folder/x.json", "/") if metadata["new_file"] else ("",)
 
 
 def settings(hint: Any, bounds: Bounds) -> Iterator[str]:

@@ -28,8 +28,8 @@ def test_errors_of_the_system_name_the_file(tmp_path):
     assert outside.describe(OSError("Cannot call rmtree on a symbolic link")) == "Cannot call rmtree on a symbolic link"
     told = outside.describe(raised(lambda: os.rename(tmp_path / "a", tmp_path / "b")))
     assert told == f"{tmp_path / 'a'} -> {tmp_path / 'b'}: No such file or directory"
-    written = ValueError("INTERNAL: Error writing /x/d [OS error 28: No space left on device]")
-    assert outside.describe(written).startswith("No space left on device: ")
+    written = ValueError("INTERNAL: Failed writing: \"/x/d\": Failed to write: ... [os_error_code='28']")
+    assert outside.describe(written) == "/x/d: No space left on device"
 
 
 def test_memory(tmp_path):

@@ -1,8 +1,10 @@
 """Printing never ends a program, whatever its terminal is."""
 
 import os
+import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -51,3 +53,43 @@ def test_a_full_disk_behind_the_output():
 def test_tables_keep_their_width_without_a_terminal():
     done = python("t.add_column('b' * 150); show(t, 200)")
     assert "b" * 150 in done.stdout.decode()
+
+
+BLOCKED = """
+import sys
+from matd3_jax.cli import command
+from matd3_jax.runtime.signals import Stop
+from matd3_jax.runtime.terminal import say
+
+def main(argv):
+    stop = Stop()
+    print("ready", file=sys.stderr, flush=True)
+    say("x" * 10**6)
+    print(f"went on after {int(stop.signal)}", file=sys.stderr, flush=True)
+    return 0
+
+command.run(main)
+"""
+
+
+@pytest.mark.parametrize("signals", [1, 2])
+def test_signals_while_nobody_reads_the_output(signals):
+    """The first is noted, and what was said is not lost; a second one ends the program, which waits for no reader."""
+    reader, writer = os.pipe()
+    how = {"stdout": writer, "stderr": subprocess.PIPE, "text": True}
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    started = subprocess.Popen([sys.executable, "-c", BLOCKED], env=environment, **how)
+    os.close(writer)
+    assert started.stderr.readline() == "ready\n"
+    time.sleep(1)
+    for _ in range(signals):
+        started.send_signal(signal.SIGINT)
+        time.sleep(0.5)
+    if signals == 1:
+        said = b"".join(iter(lambda: os.read(reader, 2**16), b""))
+        assert said.count(b"x") == 10**6 and b"SIGINT: writing a checkpoint" in said and started.wait(60) == 0
+        assert started.stderr.read() == "went on after 2\n"
+    else:
+        assert started.wait(60) == 130
+        assert started.stderr.read() == ""
+    os.close(reader)

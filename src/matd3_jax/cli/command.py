@@ -75,7 +75,11 @@ def run(main: Callable[[Sequence[str]], int], command: Command | None = None) ->
     if command is not None and options.asks_for_help(sys.argv[1:]):
         say(command.help())
         sys.exit(0)
-    exit_code = code(main, sys.argv[1:])
+    try:
+        exit_code = code(main, sys.argv[1:])
+    except SystemExit:  # after a second signal
+        leave(at_once=True)
+        raise
     leave()
     sys.exit(exit_code)
 

@@ -7,7 +7,8 @@ import traceback
 import matd3_jax
 
 _IN_A_MESSAGE = re.compile(r"os_error_code='(\d+)'")
-"""How tensorstore, which writes checkpoints, passes an error of the system on."""
+_FILE = re.compile(r'Failed \w+: "([^"]+)"')
+"""How tensorstore, which writes checkpoints, passes an error of the system on, and which file it names."""
 
 
 def describe(error: BaseException) -> str | None:
@@ -21,7 +22,8 @@ def describe(error: BaseException) -> str | None:
         return _of_a_package(error, text)
     found = _IN_A_MESSAGE.search(text)
     if found:
-        return f"{os.strerror(int(found[1]))}: {text}"
+        file = _FILE.search(text)
+        return f"{file[1] if file else text}: {os.strerror(int(found[1]))}"
     if _in_the_start_of_jax(error):
         platforms = os.environ.get("JAX_PLATFORMS", "")
         why = f": {text}" if text else ""

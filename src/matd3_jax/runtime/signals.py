@@ -5,7 +5,7 @@ import sys
 import threading
 
 from matd3_jax.runtime.multihost import Processes
-from matd3_jax.runtime.terminal import say
+from matd3_jax.runtime.terminal import note
 
 NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
 
@@ -36,4 +36,4 @@ class Stop:
     def _tell(self) -> None:
         self._came.wait()
         assert self.signal is not None
-        say(f"\n{self.signal.name}: writing a checkpoint after this interval (again: stop at once)")
+        note(f"\n{self.signal.name}: writing a checkpoint after this interval (again: stop at once)")

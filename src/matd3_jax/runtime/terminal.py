@@ -16,6 +16,13 @@ def say(text: str, end: str = "\n") -> None:
     _write(sys.stdout, text + end)
 
 
+def note(text: str) -> None:
+    """`say` from a thread: takes none of the locks of standard output, on which Python would fail where the main thread
+    ends while nobody reads."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        os.write(sys.stdout.fileno(), (text + "\n").encode(sys.stdout.encoding or "ascii", "backslashreplace"))
+
+
 def show(renderable: Any, width: int | None = None) -> None:
     """Print a table of rich; of `width` characters where standard output is no terminal."""
     from rich.console import Console
@@ -43,12 +50,18 @@ def complain(text: str) -> None:
     _write(sys.stderr, line + "\n")
 
 
-def leave() -> None:
-    """Give up what could not be printed: Python would try once more at the end, fail, and change the exit code."""
+def leave(at_once: bool = False) -> None:
+    """Give up what could not be printed: Python would try once more at the end, fail, and change the exit code.
+
+    at_once: wait for no reader of what is still to be printed.
+    """
     for stream in (sys.stdout, sys.stderr):
+        if stream is None:
+            continue
         try:
-            if stream is not None:
-                stream.flush()
+            if at_once:
+                _give_up(stream)
+            stream.flush()
         except (OSError, ValueError):
             _give_up(stream)
 

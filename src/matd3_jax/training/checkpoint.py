@@ -36,7 +36,8 @@ RENAMED = ((".rollouts", ".collects"), ("_optimizer", "_optimiser"))
 ASIDE = ".set_aside"
 """At the end of the names of checkpoints that a run no longer leads to."""
 
-logging.getLogger("absl").setLevel(logging.ERROR)  # Orbax logs every step at INFO and warns of its own defaults.
+# Orbax logs every step at INFO, warns of its own defaults, and logs what it raises with its traceback.
+logging.getLogger("absl").setLevel(logging.CRITICAL)
 
 
 def save(
