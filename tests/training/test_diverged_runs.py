@@ -88,7 +88,7 @@ def test_stop_ends_the_run_with_a_checkpoint(blown, tmp_path, capsys):
     assert train.main([*SMALL, f"out={tmp_path}", "name=run", "on_divergence=stop"]) == 3
     out = capsys.readouterr().out
     step = checkpoint.steps(tmp_path / "run" / "checkpoints")[-1]
-    assert step < 1200 and f"stopped at env step {step:,} since a seed diverged; go on with:" in out
+    assert step < 1200 and f"stopped at env step {step:,} since a seed diverged; resume with:" in out
     assert not (tmp_path / "run" / "summary.json").exists() and (tmp_path / "run" / "learning_curve.png").exists()
     # Resumed, it goes on: no other seed diverges.
     assert train.main([f"resume={tmp_path / 'run'}"]) == 0

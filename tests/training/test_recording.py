@@ -286,13 +286,13 @@ def test_a_signal_is_noted_while_something_is_printed(monkeypatch):
     from matd3_jax.runtime import signals
 
     told = threading.Event()
-    monkeypatch.setattr(signals, "say", lambda line: told.set())
+    monkeypatch.setattr(signals, "note", lambda line: told.set())
     before = {name: signal.getsignal(getattr(signal, name)) for name in signals.NAMES}
     try:
         stop = signals.Stop()
         main = threading.current_thread()
         printed = []
-        monkeypatch.setattr(signals, "say", lambda line: (printed.append(threading.current_thread()), told.set()))
+        monkeypatch.setattr(signals, "note", lambda line: (printed.append(threading.current_thread()), told.set()))
         signal.raise_signal(signal.SIGHUP)
         assert stop.signal == signal.SIGHUP
         assert told.wait(10) and printed[0] is not main

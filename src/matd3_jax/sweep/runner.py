@@ -308,6 +308,8 @@ def train(settings: Mapping[str, Config], folder: Path, budget: int | None = Non
     The same call resumes where it was stopped, and finished runs are used as they are. `budget`: as for `Sweep.add`.
     Raises UserError, and Stopped when a signal ended the training.
     """
+    if not settings:
+        return {}
     sweep = Sweep(folder)
     with sweep.planning():
         runs = sweep.add(settings, budget)

@@ -1,6 +1,7 @@
 """Robots whose joints are shared out among agents."""
 
 import os
+import sys
 
 
 def _import_mujoco() -> None:
@@ -13,9 +14,14 @@ def _import_mujoco() -> None:
             raise
         os.environ["MUJOCO_GL"] = "disable"
         try:
-            import mujoco  # noqa: F401
+            import mujoco
         finally:
             os.environ["MUJOCO_GL"] = wanted
+        # What the first attempt had imported already is not imported, and hence not made an attribute, again.
+        for name, module in list(sys.modules.items()):
+            package, _, own = name.partition(".")
+            if package == "mujoco" and own and "." not in own and not hasattr(mujoco, own):
+                setattr(mujoco, own, module)
 
 
 _import_mujoco()
