@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments import evaluations, figures, study, verdict
-from experiments.study import RESULTS, Study, StudyOptions
+from experiments.study import RESULTS, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
@@ -100,7 +100,7 @@ def details(table: Table) -> list[str]:
     return evaluations.table(("algorithm", *evaluations.HEAD), rows)
 
 
-STUDY = Study(
+STUDY = study.of_evaluations(
     name="ant",
     title="Robots shared out among agents",
     help=str(__doc__),
@@ -112,12 +112,8 @@ STUDY = Study(
     claims=claims,
     draw=draw,
     details=details,
-    keep=("eval_*",),
-    evaluations=True,
     options=AntOptions,
     folders=folders,
-    data="curves.csv",
-    figure="curves.png",
 )
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from experiments import evaluations, figures, study, verdict
 from experiments.squashing import COMMON
-from experiments.study import Study, StudyOptions
+from experiments.study import StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
@@ -117,7 +117,7 @@ def details(table: Table) -> list[str]:
     return evaluations.table(("changed", "mean in the last third", *evaluations.HEAD), rows)
 
 
-STUDY = Study(
+STUDY = study.of_evaluations(
     name="recipe",
     title="Parts of the fast recipe",
     help=str(__doc__),
@@ -129,9 +129,6 @@ STUDY = Study(
     claims=claims,
     draw=draw,
     details=details,
-    keep=("eval_*",),
-    evaluations=True,
-    data="curves.csv",
     figure="parts.png",
 )
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments import evaluations, figures, study, verdict
-from experiments.study import Study, StudyOptions
+from experiments.study import StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
@@ -73,7 +73,7 @@ def details(table: Table) -> list[str]:
     return evaluations.table(("robot", "split", *evaluations.HEAD, "HARL's MATD3"), rows)
 
 
-STUDY = Study(
+STUDY = study.of_evaluations(
     name="robots",
     title="MATD3 on robots, one recipe",
     help=str(__doc__),
@@ -83,10 +83,6 @@ STUDY = Study(
     claims=claims,
     draw=draw,
     details=details,
-    keep=("eval_*",),
-    evaluations=True,
-    data="curves.csv",
-    figure="curves.png",
 )
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments import evaluations, figures, study, verdict
-from experiments.study import Study, StudyOptions
+from experiments.study import StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
@@ -88,7 +88,7 @@ def details(table: Table) -> list[str]:
     return evaluations.table(("squashing, learning rate", "mean in the last third", *evaluations.HEAD), rows)
 
 
-STUDY = Study(
+STUDY = study.of_evaluations(
     name="squashing",
     title="Squashing of the actors' outputs and their learning rate",
     help=str(__doc__),
@@ -100,10 +100,6 @@ STUDY = Study(
     claims=claims,
     draw=draw,
     details=details,
-    keep=("eval_*",),
-    evaluations=True,
-    data="curves.csv",
-    figure="curves.png",
 )
 
 

@@ -95,6 +95,10 @@ class Study:
         return Command(program, self.options, self.help, examples=(f"{program} scale=small",))
 
 
+of_evaluations = functools.partial(Study, keep=("eval_*",), evaluations=True, data="curves.csv", figure="curves.png")
+"""A study whose curves are deterministic evaluations along training."""
+
+
 def main(study: Study, argv: Sequence[str]) -> int:
     """Run a study's command; the exit code."""
     if asks_for_help(argv):

@@ -15,6 +15,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from checkpoint_arrays import leaves
 
 from matd3_jax import config
 from matd3_jax.cli import command, evaluate, train
@@ -44,18 +45,6 @@ def run(out: Path, *more: str) -> int:
 def rows(path: Path) -> list[dict[str, str]]:
     with (path / "metrics.csv").open(newline="") as file:
         return list(csv.DictReader(file))
-
-
-def leaves(path: Path) -> dict[str, np.ndarray]:
-    """Every array of the last checkpoint."""
-    import orbax.checkpoint as ocp
-
-    folder = checkpoint.verify(path / "checkpoints")
-    with ocp.StandardCheckpointer() as reader:
-        found = dict(reader.restore(folder / "state"))
-        for seed in sorted((folder / "replay").iterdir()):
-            found[f"replay {seed.name}"] = reader.restore(seed)["rows"]
-    return {name: np.asarray(leaf) for name, leaf in found.items()}
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
+from checkpoint_arrays import leaves
 from jax._src.clusters.slurm_cluster import SlurmCluster
 
 from matd3_jax import config
@@ -329,16 +330,6 @@ def test_two_processes_make_the_run_of_one(alone, tmp_path):
     states = [leaves(path) for path in (run, alone)]
     assert any("optimizer" in name for name in states[0])
     same_numbers(*states, rtol=1e-4)
-
-
-def leaves(run: Path) -> dict[str, np.ndarray]:
-    """Every array of a run's last checkpoint, which one process has written."""
-    folder = checkpoint.verify(run / "checkpoints")
-    with ocp.StandardCheckpointer() as reader:
-        found = dict(reader.restore(folder / "state"))
-        for seed in sorted((folder / "replay").iterdir()):
-            found[f"replay {seed.name}"] = reader.restore(seed)["rows"]
-    return {name: np.asarray(leaf) for name, leaf in found.items()}
 
 
 @pytest.mark.slow

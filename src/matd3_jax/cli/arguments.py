@@ -31,9 +31,9 @@ class OfProcesses:
 
 @dataclasses.dataclass(frozen=True)
 class Train(OfProcesses):
-    """Train with every seed, and leave a run directory; or go on with one (resume=)."""
+    """Train with every seed, and leave a run directory; or resume one (resume=)."""
 
-    resume: Path | None = option("go on with this run; total_steps= may be raised", default=None, metavar="RUN_DIR")
+    resume: Path | None = option("resume this run; total_steps= may be raised", default=None, metavar="RUN_DIR")
     checkpoint: int | None = option(
         "with resume: go on from the checkpoint of this env step", default=None, least=0, otherwise="the last"
     )
@@ -69,7 +69,7 @@ class Sweep(OfProcesses):
     )
     name: str | None = option("of the sweep's directory", default=None, metavar="NAME", otherwise="made from the time")
     out: Path = option("where the sweep's directory goes", default=Path("runs"))
-    resume: Path | None = option("go on with this sweep", default=None, metavar="SWEEP_DIR")
+    resume: Path | None = option("resume this sweep", default=None, metavar="SWEEP_DIR")
     batch: int | None = option("with resume: train this batch alone", default=None, metavar="K", least=0)
     launcher_options: tuple[str, ...] = others("an option of the launcher", prefix="launcher.")
     settings: tuple[str, ...] = others("a setting, with one value or several")

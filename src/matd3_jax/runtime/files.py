@@ -96,16 +96,12 @@ def append_text(path: Path, text: str) -> None:
 def sync_folder(folder: Path) -> None:
     """Bring the names in a folder to the disk, on systems that can."""
     with contextlib.suppress(OSError):
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+        sync(folder, os.O_RDONLY)
 
 
-def sync(path: Path) -> None:
+def sync(path: Path, flags: int = os.O_RDWR) -> None:
     """Bring what was written to a file to the disk."""
-    handle = os.open(path, os.O_RDWR)
+    handle = os.open(path, flags)
     try:
         os.fsync(handle)
     finally:

@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.figures import learning_curves, q_bias
 from matd3_jax.runs import divergence, overestimation, summary
@@ -17,11 +19,23 @@ def draw(
 
     Raises UserError where it has no metrics yet.
     """
-    metrics = run.read_metrics()
+    _draw(run, run.read_metrics(), layout, title, with_q_bias, diverged)
+
+
+def _draw(
+    run: RunDirectory,
+    metrics: Mapping[str, np.ndarray],
+    layout: JointLayout,
+    title: str,
+    with_q_bias: bool,
+    diverged: Mapping[int, Divergence],
+) -> Mapping[str, np.ndarray]:
+    """Draw the figures of a metrics table: its rows without the seeds that diverged."""
     learning_curves.learning_curve(run.curve, metrics, title, diverged)
     sound = divergence.without(metrics, diverged)
     if with_q_bias and sound["step"].size:
         q_bias.draw(run.q_bias, sound, layout.by_team(), title)
+    return sound
 
 
 def finish(
@@ -42,9 +56,8 @@ def finish(
     """
     metrics = run.read_metrics()
     diverged = divergence.earliest(divergence.of_table(metrics), diverged)
-    draw(run, layout, title, with_q_bias, diverged)
+    sound = _draw(run, metrics, layout, title, with_q_bias, diverged)
     found = summary.summary(metrics, diverged, **facts)
-    sound = divergence.without(metrics, diverged)
     if with_q_bias and sound["step"].size:
         found["overestimation"] = overestimation.summary(sound, layout.agents)
     run.write_summary(found)
