@@ -24,6 +24,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "helpers"))
 
+import faults  # noqa: E402
 import numpy as np  # noqa: E402
 from checkpoint_arrays import leaves  # noqa: E402
 from disturbed import Ended, Job, Process  # noqa: E402
@@ -40,6 +41,8 @@ SWEEP = [*SETTINGS, "total_steps=400", "checkpoint_every=100", "algo.lr=0.01,0.0
 SAME, SAID, LOST = "resumed to the same bits", "refused in one line", "LOST"
 KINDS = 17
 """How many `Torture.trials` there are."""
+ERRORS = slice(8, 14)
+"""Those of errors and damaged files."""
 
 UNNOTICED = "changed, without a checksum to notice"
 Outcome = str
@@ -100,20 +103,23 @@ class Torture:
     rng: random.Random
     table: dict[tuple[str, str, Outcome], int] = dataclasses.field(default_factory=collections.Counter)
     failures: list[str] = dataclasses.field(default_factory=list)
+    kills: int = 0
+    injected: int = 0
+    """Errors and short writes that commands got, and files damaged."""
 
     def __post_init__(self) -> None:
         self.process, self.other = Process(self.place), Process(self.place)
         self.whole, self.whole_sweep = self.place / "whole" / "run", self.place / "whole sweep" / "sweep"
         begun = time.monotonic()
-        first = self.process.run(Job(train(self.whole), self.whole.parent))
+        first = self.run(Job(train(self.whole), self.whole.parent))
         assert first.code == 0, first.output
         self.calls = first.calls
         again = self.place / "again" / "run"
         begun = time.monotonic()
-        assert self.process.run(Job(train(again), again.parent)).code == 0
+        assert self.run(Job(train(again), again.parent)).code == 0
         self.seconds = time.monotonic() - begun
         assert same(again, self.whole) == ""
-        swept = self.process.run(Job(sweep(self.whole_sweep), self.whole_sweep.parent))
+        swept = self.run(Job(sweep(self.whole_sweep), self.whole_sweep.parent))
         assert swept.code == 0, swept.output
         self.sweep_calls = swept.calls
         self.number = 0
@@ -121,6 +127,15 @@ class Torture:
     def close(self) -> None:
         self.process.close()
         self.other.close()
+
+    def run(self, job: Job) -> Ended:
+        """Run a command, and count what hit it."""
+        ended = self.process.run(job)
+        if ended.code is None:
+            self.kills += 1
+        elif job.largest is not None or job.how in faults.INJECTED:
+            self.injected += 1
+        return ended
 
     def path(self, kind: str = "run") -> Path:
         """A new directory's, which has a folder to itself."""
@@ -145,7 +160,7 @@ class Torture:
 
     def start_or_resume(self, path: Path) -> Ended:
         """What a user does after a run ended before its time."""
-        return self.process.run(Job(resume(path) if path.exists() else train(path), path.parent))
+        return self.run(Job(resume(path) if path.exists() else train(path), path.parent))
 
     def settle(self, fault: str, path: Path, ended: Ended) -> None:
         """Resume a run after a fault, and note whether it comes to the unbroken run's bits."""
@@ -162,50 +177,50 @@ class Torture:
 
     def kill_at_a_call(self) -> None:
         path, how = self.path(), self.rng.choice(["kill", "kill after", "half"])
-        ended = self.process.run(Job(train(path), path.parent, how, self.rng.randrange(len(self.calls))))
+        ended = self.run(Job(train(path), path.parent, how, self.rng.randrange(len(self.calls))))
         self.settle("SIGKILL at a random call", path, ended)
 
     def power_cut(self) -> None:
         """At a random call; of every file is left what was synced."""
         path = self.path()
-        ended = self.process.run(Job(train(path), path.parent, "power", self.rng.randrange(len(self.calls))))
+        ended = self.run(Job(train(path), path.parent, "power", self.rng.randrange(len(self.calls))))
         self.settle("power cut at a random call", path, ended)
 
     def kill_at_a_time(self) -> None:
         path = self.path()
-        ended = self.process.run(Job(train(path), path.parent, after=self.rng.uniform(0, 1.1 * self.seconds)))
+        ended = self.run(Job(train(path), path.parent, after=self.rng.uniform(0, 1.1 * self.seconds)))
         self.settle("SIGKILL at a random time", path, ended)
 
     def kill_there(self, fault: str, pattern: str, hows: tuple[str, ...]) -> None:
         path = self.path()
         at = self.rng.randrange(sum(bool(re.search(pattern, call)) for call in self.calls))
-        ended = self.process.run(Job(train(path), path.parent, self.rng.choice(hows), at, pattern))
+        ended = self.run(Job(train(path), path.parent, self.rng.choice(hows), at, pattern))
         self.settle(fault, path, ended)
 
     def kill_at_resumes(self) -> None:
         """Killed again and again, at the resumes too; once by an older checkpoint."""
         path = self.path()
         at = self.rng.randrange(len(self.calls) // 3, len(self.calls))
-        ended = self.process.run(Job(train(path), path.parent, "kill", at))
+        ended = self.run(Job(train(path), path.parent, "kill", at))
         for _ in range(self.rng.randint(1, 3)):
             steps = checkpoint.steps(path / "checkpoints")
             more = [f"checkpoint={steps[0]}"] if len(steps) > 1 and self.rng.random() < 0.5 else []
             how = self.rng.choice(["kill", "kill after", "half"])
             if path.exists():
-                ended = self.process.run(Job(resume(path, *more), path.parent, how, self.rng.randrange(40)))
+                ended = self.run(Job(resume(path, *more), path.parent, how, self.rng.randrange(40)))
         self.settle("SIGKILL at several resumes", path, ended)
 
     def error_at_a_call(self, how: str, calls: str) -> None:
         path = self.path()
         pattern = f"^({'|'.join(calls.split())}) "
         at = self.rng.randrange(sum(bool(re.search(pattern, call)) for call in self.calls))
-        ended = self.process.run(Job(train(path), path.parent, how, at, pattern))
+        ended = self.run(Job(train(path), path.parent, how, at, pattern))
         self.settle({"short": "short write"}.get(how, how), path, ended)
 
     def file_limit(self) -> None:
         """No file may grow beyond some bytes: fails in Orbax's C++, too."""
         path = self.path()
-        ended = self.process.run(Job(train(path), path.parent, largest=self.rng.choice([100, 1000, 3000, 6000, 12000])))
+        ended = self.run(Job(train(path), path.parent, largest=self.rng.choice([100, 1000, 3000, 6000, 12000])))
         self.settle("EFBIG (also in C++)", path, ended)
 
     def damage_a_checkpoint(self) -> None:
@@ -214,11 +229,11 @@ class Torture:
         *_, before, last = checkpoint.steps(path / "checkpoints")
         file = self.rng.choice([one for one in (path / "checkpoints" / str(last)).rglob("*") if one.is_file()])
         what = self.damage(file)
-        ended = self.process.run(Job(resume(path), path.parent))
+        ended = self.run(Job(resume(path), path.parent))
         fault = f"checkpoint file {what}"
         if not (one_line(ended) and "is damaged" in ended.output and f"checkpoint={before}" in ended.output):
             return self.note(fault, None, LOST, f"{file.relative_to(path)}: {ended.output[-600:]}")
-        again = self.process.run(Job(resume(path, f"checkpoint={before}"), path.parent))
+        again = self.run(Job(resume(path, f"checkpoint={before}"), path.parent))
         wrong = again.output[-600:] if again.code else same(path, self.whole)
         self.note(fault, ended, LOST if wrong else f"named; the checkpoint before it {SAME}", wrong)
         shutil.rmtree(path.parent)
@@ -228,7 +243,7 @@ class Torture:
         name = self.rng.choice(["metrics.csv", "config.yaml", "machine.json", ".lock"])
         (path / name).touch()
         what = self.damage(path / name)
-        ended = self.process.run(Job(resume(path), path.parent))
+        ended = self.run(Job(resume(path), path.parent))
         fault = f"{name} {what}"
         if ended.code == 0:
             wrong = same(path, self.whole)
@@ -261,10 +276,8 @@ class Torture:
         """A sweep that is killed while it plans is started again with the same command."""
         path = self.path("sweep")
         how = self.rng.choice(["kill", "kill after", "half"])
-        ended = self.process.run(
-            Job(sweep(path, "train=false"), path.parent, how, self.rng.randrange(self.planned() + 1))
-        )
-        again = self.process.run(Job(sweep(path, "train=false"), path.parent))
+        ended = self.run(Job(sweep(path, "train=false"), path.parent, how, self.rng.randrange(self.planned() + 1)))
+        again = self.run(Job(sweep(path, "train=false"), path.parent))
         if again.code == 2 and (path / "sweep.json").exists():
             again = again._replace(code=0)  # the plan was there already
         self.compare_sweeps("sweep killed while it plans", path, ended, again, trained=False)
@@ -272,8 +285,8 @@ class Torture:
     def kill_a_sweep(self) -> None:
         path = self.path("sweep")
         at = self.rng.randrange(self.planned() + 3, len(self.sweep_calls))
-        ended = self.process.run(Job(sweep(path), path.parent, self.rng.choice(["kill", "kill after", "half"]), at))
-        again = self.process.run(Job(["sweep", f"resume={path}"], path.parent))
+        ended = self.run(Job(sweep(path), path.parent, self.rng.choice(["kill", "kill after", "half"]), at))
+        again = self.run(Job(["sweep", f"resume={path}"], path.parent))
         self.compare_sweeps("sweep killed while it trains", path, ended, again, trained=True)
 
     def compare_sweeps(self, fault: str, path: Path, ended: Ended, again: Ended, trained: bool) -> None:
@@ -310,6 +323,7 @@ class Torture:
         return next(k for k, call in enumerate(self.sweep_calls) if call == "replace sweep/sweep.json")
 
     def damage(self, file: Path) -> str:
+        self.injected += 1
         data = bytearray(file.read_bytes())
         what = self.rng.choice(["with a bit flipped", "cut", "emptied", "deleted", "with zeros at its end"])
         if what == "deleted":
@@ -351,7 +365,8 @@ class Torture:
         """The table, as Markdown."""
         rows = ["| fault | the run it hit | outcome | trials |", "|---|---|---|---|"]
         rows += [f"| {' | '.join(key)} | {count} |" for key, count in sorted(self.table.items())]
-        return "\n".join([*rows, "", f"{sum(self.table.values())} trials, {len(self.failures)} lost"])
+        hit = f"{self.kills} kills (power cuts among them), {self.injected} injected faults"
+        return "\n".join([*rows, "", f"{sum(self.table.values())} trials: {hit}, {len(self.failures)} lost"])
 
 
 def _same_member(path: Path, whole: Path) -> str:
@@ -389,7 +404,8 @@ def main(argv: list[str]) -> int:
             end = time.monotonic() + 60 * minutes
             print(f"an unbroken run: {torture.seconds:.1f} s, {len(torture.calls)} calls that change files", flush=True)
             while time.monotonic() < end:
-                for trial in torture.trials():
+                trials = torture.trials()
+                for trial in [*trials, *trials[ERRORS]]:  # errors twice: rounds have some more kills than errors
                     if time.monotonic() < end:
                         trial()
         finally:

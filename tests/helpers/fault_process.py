@@ -1,15 +1,15 @@
 """A process that runs commands one after the other, as `matd3 COMMAND ...` would, and fails or dies where it is told.
 
-Jobs come as lines of JSON on its standard input: {"argv", "folder" (which is watched), "output", "log", "how", "at",
-"where", "largest"}; the exit code of each goes to its standard output. Imports and compiled programs serve all jobs.
+Jobs come through a pipe: {"argv", "folder" (which is watched), "output", "log", "how", "at", "where", "largest"}; the
+exit code of each goes back. Compiled programs serve all jobs; what is imported here is there before the fork.
 """
 
 import contextlib
-import json
 import os
 import signal
 import sys
 import traceback
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import faults
@@ -31,13 +31,14 @@ def run(job: dict) -> int:
             return 1
 
 
-def serve() -> None:
+def serve(jobs: Connection) -> None:
     """Take jobs until there are no more."""
-    answers = os.fdopen(os.dup(1), "w")
     handlers = {name: signal.getsignal(name) for name in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-    print("ready", file=answers, flush=True)
-    for line in sys.stdin:
-        job = json.loads(line)
+    while True:
+        try:
+            job = jobs.recv()
+        except EOFError:
+            return
         output = os.open(job["output"], os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         os.dup2(output, 1)
         os.dup2(output, 2)
@@ -48,8 +49,4 @@ def serve() -> None:
         for stream in (sys.stdout, sys.stderr):
             with contextlib.suppress(OSError):
                 stream.flush()
-        print(code, file=answers, flush=True)
-
-
-if __name__ == "__main__":
-    serve()
+        jobs.send(code)

@@ -16,6 +16,9 @@ from typing import Any
 ERRORS = {"ENOSPC": errno.ENOSPC, "EIO": errno.EIO}
 """A full disk stays full until the process ends; an error of a device comes once."""
 
+INJECTED = ("short", *ERRORS)
+"""What a process survives."""
+
 WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 
 
