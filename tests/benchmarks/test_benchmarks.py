@@ -8,7 +8,7 @@ import numpy as np
 import pictures
 import pytest
 
-from benchmarks import compile_times, fresh, growth, growth_figure, guard, loop
+from benchmarks import compile_times, fresh, growth, growth_figure, guard, loop, recording
 from benchmarks.loop import copies_in
 from matd3_jax import config
 from matd3_jax.errors import UserError
@@ -153,3 +153,18 @@ def test_a_fresh_process_answers_or_says_what_went_wrong(tmp_path):
     ):
         with pytest.raises(error, match=text):
             fresh.run("told", [word], environment)
+
+
+def test_recording_counts_the_replays_that_it_writes(tmp_path):
+    """Two seeds' full replays of 400 rows: the checkpoint is at least as large, and nothing is left behind."""
+    line = ["env=point_reach", "algo=iddpg", "seeds=2", "learning_starts=200", "num_envs=4", "rollout_length=5"]
+    line += ["batch_size=16", "replay_capacity=400", "algo.hidden=[8]", "log_every=100", "eval_every=0"]
+    out = tmp_path / "report.json"
+    argv = [*line, "total_steps=600", "intervals=1", "repeats=1", f"folder={tmp_path}", f"out={out}"]
+    assert recording.main(argv) == 0
+    found = json.loads(out.read_text())
+    row_size = TrainingSession(config.load([*line, "total_steps=600"])).layout.row_size
+    assert found["checkpoint"]["rows_of_a_seed"] == 400
+    replays = 2 * 400 * row_size * 4
+    assert replays < found["checkpoint"]["bytes"] < replays + 200_000
+    assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
