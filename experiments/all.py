@@ -22,13 +22,15 @@ from experiments import (
     target_smoothing,
     verdict,
 )
-from experiments.study import RESULTS, Stopped, Study
+from experiments.estimating import Estimator
+from experiments.study import RESULTS, Stopped, Study, StudyOptions
 from experiments.tidy import Table
 from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option, others
 from matd3_jax.errors import UserError, nearest
 from matd3_jax.runs.paths import check_directory
 from matd3_jax.runtime import files
+from matd3_jax.training import cost
 
 STUDIES: dict[str, Study] = {
     module.STUDY.name: module.STUDY
@@ -44,6 +46,10 @@ STUDIES: dict[str, Study] = {
     )
 }
 """In this order: first what the paper's main claims are about, last what takes longest."""
+
+
+EACH_STUDY = 20.0
+"""Seconds more for measuring with each experiment that is estimated."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,12 +73,12 @@ def main(argv: Sequence[str]) -> int:
     check_directory(given.out, "out")
     chosen = {name: one for name, one in STUDIES.items() if name not in given.skip}
     parsed = {name: study.parse(one, given.rest) for name, one in chosen.items()}
+    if any(options.estimate for options in parsed.values()):
+        return _estimate(chosen, parsed, given)
     lines: list[str] = []
     failed = 0
     for name, one in chosen.items():
-        runs_folder, out_folder = study.folders(one, parsed[name])
-        more = [f"out={given.out / out_folder.name}"]
-        more += [] if given.runs is None else [f"runs={given.runs / runs_folder.name}"]
+        out_folder, more = _places(one, parsed[name], given)
         print(f"\n==== {name}", flush=True)
         lines += [f"## {one.title}", ""]
         try:
@@ -93,6 +99,29 @@ def main(argv: Sequence[str]) -> int:
     summary = given.out / ("summary_small.md" if small else "summary.md")
     files.write_text(summary, "\n".join([*head, *lines]).rstrip() + "\n")
     print(f"\nsummary: {summary}")
+    return failed
+
+
+def _places(one: Study, options: StudyOptions, given: AllOptions) -> tuple[Path, list[str]]:
+    """(folder of an experiment's results, its arguments that say where everything is)."""
+    runs_folder, out_folder = study.folders(one, options)
+    more = [f"out={given.out / out_folder.name}"]
+    return out_folder, more + ([] if given.runs is None else [f"runs={given.runs / runs_folder.name}"])
+
+
+def _estimate(chosen: dict[str, Study], parsed: dict[str, StudyOptions], given: AllOptions) -> int:
+    """What all experiments lack, each measured a while, and the total: the exit code."""
+    estimator, steps, seconds, failed = Estimator(0.0), 0, 0.0, 0
+    for name, one in chosen.items():
+        print(f"\n==== {name}", flush=True)
+        estimator.seconds += EACH_STUDY
+        try:
+            found = study.estimate(one, [*given.rest, *_places(one, parsed[name], given)[1]], estimator)
+            steps, seconds = steps + found[0], seconds + found[1]
+        except UserError as error:
+            print(f"error: {error}")
+            failed = 2
+    print(f"\nall: {steps:,} env steps, {cost.duration(seconds)}")
     return failed
 
 

@@ -5,16 +5,11 @@ the base by the mean of its evaluations in the last third.
 """
 
 from collections.abc import Sequence
-from pathlib import Path
 
-from experiments import evaluations, figures, study, verdict
+from experiments import study
+from experiments.one_at_a_time import OneAtATime, no_difference
 from experiments.squashing import COMMON
-from experiments.study import StudyOptions
-from experiments.tidy import Table
-from experiments.verdict import Claim
 from matd3_jax.cli import command
-from matd3_jax.figures.style import SERIES
-from matd3_jax.stats.text import seeds
 
 BASE = "base"
 CHANGES: dict[str, list[str]] = {
@@ -58,63 +53,15 @@ SCALES = {
 }
 
 
-def settings(scale: str, options: StudyOptions) -> dict[str, list[str]]:
-    common = [*COMMON, *SCALES[scale], "algo.actor_output=tanh"]
-    lines = {}
-    for name, changes in CHANGES.items():
-        keys = {change.split("=")[0] for change in changes}
-        kept = [line for line in common if line.split("=")[0] not in keys]
-        lines[label(name)] = [*kept, *changes]
-    return lines
-
-
-def label(name: str) -> str:
-    """A name as that of a run directory."""
-    return name.replace(",", "").replace(" ", "_")
-
-
-def parts(table: Table) -> dict[str, Table]:
-    """The rows of each setting that has been trained to the end, by its name in `CHANGES`."""
-    lines = zip(CHANGES, settings("paper", StudyOptions()).values(), strict=True)
-    found = {name: table.where(**study.key_values(KEYS, line)) for name, line in lines}
-    end = table["step"].max() if len(table) else 0
-    return {name: part for name, part in found.items() if len(part) and part["step"].max() > 0.99 * end}
-
-
-def claims(table: Table) -> list[Claim]:
-    found = dict.fromkeys(CHANGES) | {name: evaluations.late(part) for name, part in parts(table).items()}
-    return [
-        verdict.compare(
-            f"{name} instead of the base's makes no difference",
-            "mean evaluation in the last third",
-            (name, found[name]),
-            (BASE, found[BASE]),
-            kind="no difference",
-            margin=100.0,
-        )
-        for name in CHANGES
-        if name != BASE
-    ]
-
-
-def draw(table: Table, path: Path) -> None:
-    there = {name: evaluations.late(part) for name, part in parts(table).items()}
-    figure, (axis,) = figures.canvas(1, width=8.0, height=1.3 + 0.4 * len(there))
-    for position, (name, values) in enumerate(reversed(list(there.items()))):
-        assert values is not None
-        figures.point(axis, position, values, SERIES[1 if name == BASE else 0], offset=0.2)
-    axis.set_yticks(range(len(there)), [f"{name} ({seeds(len(there[name]))})" for name in reversed(there)])
-    axis.set_xlabel("evaluations in the last third: mean and its 95 % interval over seeds")
-    axis.set_ylim(-0.6, len(there) - 0.4)
-    figure.suptitle("Ant, two halves, MATD3, 300,000 env steps: one part changed at a time", fontsize=10)
-    figures.save(figure, path)
-
-
-def details(table: Table) -> list[str]:
-    rows = [
-        [name, figures.interval(evaluations.late(part)), *evaluations.row(part)] for name, part in parts(table).items()
-    ]
-    return evaluations.table(("changed", "mean in the last third", *evaluations.HEAD), rows)
+PARTS = OneAtATime(
+    base=BASE,
+    changes=CHANGES,
+    common=lambda scale: [*COMMON, *SCALES[scale], "algo.actor_output=tanh"],
+    keys=KEYS,
+    claim=no_difference(100.0),
+    title="Ant, two halves, MATD3, 300,000 env steps: one part changed at a time",
+)
+settings, claims, draw, details = PARTS.settings, PARTS.claims, PARTS.draw, PARTS.details
 
 
 STUDY = study.of_evaluations(

@@ -12,8 +12,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments import collecting, verdict
+from experiments import collecting, estimating, machine_time, verdict
 from experiments.collecting import Data
+from experiments.estimating import Estimator
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax import config
@@ -38,6 +39,10 @@ class StudyOptions:
     )
     seeds: int | None = option("trials of each setting", default=None, least=1, otherwise="the scale's")
     train: bool = option("false: report what there is", default=True)
+    estimate: bool = option(
+        "true: print what is missing, how long it would take here (measured in a minute) and its memory; write nothing",
+        default=False,
+    )
     only: str | None = option(
         "train only the settings whose names match, for instance only='*maddpg*'", default=None, metavar="PATTERN"
     )
@@ -104,6 +109,9 @@ def main(study: Study, argv: Sequence[str]) -> int:
     if asks_for_help(argv):
         print(study.command.help())
         return 0
+    if parse(study, argv).estimate:
+        estimate(study, argv, Estimator())
+        return 0
     try:
         claims = run(study, argv)
     except Stopped as stopped:
@@ -113,36 +121,73 @@ def main(study: Study, argv: Sequence[str]) -> int:
     return 0
 
 
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """What a call of a study asks for, and what there is already.
+
+    Attributes:
+        folder: of the run directories.
+        out: where the results are.
+        wanted: the settings by label.
+        missing: those of them that are to be trained.
+    """
+
+    options: Any
+    folder: Path
+    out: Path
+    data: Data
+    wanted: dict[str, Config]
+    missing: dict[str, Config]
+
+    @classmethod
+    def of(cls, study: Study, argv: Sequence[str]) -> "Plan":
+        """Read the arguments, check them and the directories, and read the data. Raises UserError."""
+        options = parse(study, argv)
+        folder, out = folders(study, options)
+        for name, path in (("runs", folder), ("out", out)):
+            check_directory(path, name)
+        devices.prepare()
+        overrides = _overrides(options)
+        lines = {label: _merged(line, overrides) for label, line in _checked(study, options, overrides).items()}
+        wanted = {label: _load(tuple(line)) for label, line in lines.items()}
+        data = collecting.read(*_files(study, out), study.keys)
+        missing = {}
+        if options.train:
+            chosen = [label for label in lines if fnmatch.fnmatch(label, options.only or "*")]
+            if not chosen:
+                raise UserError(f"only={options.only}: matches none of {', '.join(lines)}")
+            missing = {label: wanted[label] for label in chosen if not data.has(label, wanted[label])}
+            for label in missing:
+                if (folder / "runs" / label / "config.yaml").exists():
+                    collecting.check(folder / "runs" / label, wanted[label])
+        return cls(options, folder, out, data, wanted, missing)
+
+
+def _files(study: Study, out: Path) -> tuple[Path, Path]:
+    return out / study.data, out / "runs.json"
+
+
+def estimate(study: Study, argv: Sequence[str], estimator: Estimator) -> tuple[int, float]:
+    """Print what a call would train and how long it would take; (env steps of all seeds, seconds). Writes nothing."""
+    plan = Plan.of(study, argv)
+    finished = len(plan.wanted) - len(plan.missing)
+    print(f"{study.title}: {len(plan.missing)} of {len(plan.wanted)} settings to train, {finished} not")
+    return estimating.report(estimating.planned(plan.missing, plan.folder), estimator)
+
+
 def run(study: Study, argv: Sequence[str]) -> list[Claim] | None:
     """Train what is missing, collect, report; the claims, or None if there are no data at all.
 
     Raises UserError for options and directories that will not do, Stopped when a signal ended the training.
     """
-    options = parse(study, argv)
-    folder, out = folders(study, options)
-    for name, path in (("runs", folder), ("out", out)):
-        check_directory(path, name)
-    devices.prepare()
-    overrides = _overrides(options)
-    lines = {label: _merged(line, overrides) for label, line in _checked(study, options, overrides).items()}
-    wanted = {label: _load(tuple(line)) for label, line in lines.items()}
-    files = out / study.data, out / "runs.json"
-    data = collecting.read(*files, study.keys)
-    paths: dict[str, list[Path]] = {}
-    if options.train:
-        chosen = [label for label in lines if fnmatch.fnmatch(label, options.only or "*")]
-        if not chosen:
-            raise UserError(f"only={options.only}: matches none of {', '.join(lines)}")
-        missing = {label: wanted[label] for label in chosen if not data.has(label, wanted[label])}
-        for label in missing:
-            if (folder / "runs" / label / "config.yaml").exists():
-                collecting.check(folder / "runs" / label, wanted[label])
-        paths = runner.train(missing, folder)
+    plan = Plan.of(study, argv)
+    data, out, files = plan.data, plan.out, _files(study, plan.out)
+    paths = runner.train(plan.missing, plan.folder) if plan.options.train else {}
     changed = False
-    for label, settings in wanted.items():
+    for label, settings in plan.wanted.items():
         if data.has(label, settings):
             continue
-        found = paths.get(label) or collecting.find(folder, label, settings)
+        found = paths.get(label) or collecting.find(plan.folder, label, settings)
         if found:
             command = line_to_copy(f"experiments.{study.name}", *_recorded(argv))
             how = {"keep": study.keep, "points": study.points, "evaluations": study.evaluations}
@@ -153,7 +198,7 @@ def run(study: Study, argv: Sequence[str]) -> list[Claim] | None:
     if changed:
         collecting.write(data, *files)
         data = collecting.read(*files, study.keys)
-    return report(study, data, out, options)
+    return report(study, data, out, plan.options)
 
 
 def report(study: Study, data: Data, out: Path, options: StudyOptions) -> list[Claim]:
@@ -162,7 +207,7 @@ def report(study: Study, data: Data, out: Path, options: StudyOptions) -> list[C
     claims = study.claims(data.finished)
     lines = [f"# {study.title}", "", study.protocol, ""]
     lines += [*departures(study, data, options), *verdict.lines(claims), "", verdict.DEFINITIONS, ""]
-    lines += [*study.details(data.table), "", f"![{study.title}]({study.figure})"]
+    lines += [*study.details(data.table), "", *machine_time.lines(data.facts), f"![{study.title}]({study.figure})"]
     files.write_text(out / "table.md", "\n".join(lines) + "\n")
     print("\n".join(lines[:-2]))
     return claims

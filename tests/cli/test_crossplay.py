@@ -13,6 +13,7 @@ from cross_cases import SEED, SMALL, meet, runs
 from matd3_jax import config
 from matd3_jax.cli import crossplay
 from matd3_jax.errors import UserError
+from matd3_jax.evaluation import cross_play
 from matd3_jax.evaluation.cross_play import TEAMS
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runs.paths import paths
@@ -180,7 +181,7 @@ def test_what_fails_while_playing_leaves_no_directory(saved, tmp_path, monkeypat
     def fail(*_):
         raise MemoryError
 
-    monkeypatch.setattr(crossplay.cross_play, "play", fail)
+    monkeypatch.setattr(cross_play, "play", fail)
     with pytest.raises(MemoryError):
         crossplay.main([f"runs={saved}/normal", "episodes=2", f"out={tmp_path}/new/place"])
     assert not list(tmp_path.iterdir())

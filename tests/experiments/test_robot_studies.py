@@ -3,9 +3,21 @@
 import numpy as np
 import pytest
 
-from experiments import critics, evaluations, recipe, robots, squashing, study, tidy
+from experiments import (
+    ablation,
+    collecting,
+    critics,
+    evaluations,
+    one_at_a_time,
+    recipe,
+    robots,
+    squashing,
+    study,
+    tidy,
+)
 from experiments.study import StudyOptions
 from experiments.tidy import Table
+from matd3_jax import config
 
 STEPS = np.array([0, 50_000, 100_000, 150_000, 200_000, 250_000, 300_000])
 SEEDS = 4
@@ -30,7 +42,7 @@ def words(claims):
     return [claim.verdict for claim in claims]
 
 
-@pytest.mark.parametrize("module", [squashing, robots, recipe, critics])
+@pytest.mark.parametrize("module", [squashing, robots, recipe, ablation, critics])
 def test_tables_survive_their_file_and_every_setting_is_drawn(module, tmp_path):
     """Numbers beside texts in a column (a noise, a range of noise) stay different settings after reading, too."""
     labels = list(module.settings("paper", StudyOptions()))
@@ -63,10 +75,10 @@ def test_squashing():
 
 def test_recipe():
     """Each change is held against the base alone."""
-    base = {recipe.label(name): 1000.0 for name in recipe.CHANGES}
+    base = {one_at_a_time.label(name): 1000.0 for name in recipe.CHANGES}
     names = [name for name in recipe.CHANGES if name != recipe.BASE]
     assert set(words(recipe.claims(table_of(recipe, base)))) == {"same"}
-    worse = base | {recipe.label(names[2]): 400.0}
+    worse = base | {one_at_a_time.label(names[2]): 400.0}
     found = words(recipe.claims(table_of(recipe, worse)))
     assert found[2] == "opposite" and set(found[:2] + found[3:]) == {"same"}
 
@@ -79,6 +91,29 @@ def test_critics():
     assert found == ["not shown", "not shown", "opposite", "opposite", "same", "opposite"]
 
 
+def test_ablation():
+    """The recipe is held against each setting without a part of it: worse without is a part that is needed."""
+    levels = {one_at_a_time.label(name): 900.0 for name in ablation.CHANGES}
+    levels |= {"the_whole_recipe": 1000.0, "n-step_1": 1000.0, "delay_1": 1100.0}
+    found = words(ablation.claims(table_of(ablation, levels)))
+    assert found == ["same", "not shown", "same", "same", "same", "opposite", "same"]
+    lines = ablation.settings("paper", StudyOptions())
+    configs = {name: config.load(line) for name, line in lines.items()}
+    whole = configs.pop("the_whole_recipe").to_dict()
+    # Each differs from the recipe in its own part, and a minibatch of another size in two numbers.
+    changed = {name: set(collecting.differences(one.to_dict(), whole)) for name, one in configs.items()}
+    changed = {name: {key for key in keys if not key.startswith("adversary.")} for name, keys in changed.items()}
+    assert [len(keys) for keys in changed.values()] == [1, 1, 1, 1, 1, 1, 2]
+
+
 def test_robots():
-    assert words(robots.claims(table_of(robots, {"ant-4x2": 3000.0}))) == ["same"]
-    assert words(robots.claims(table_of(robots, {"ant-4x2": 2000.0}))) == ["opposite"]
+    found = robots.claims(table_of(robots, {"ant-4x2-matd3": 3000.0, "ant-4x2-maddpg": 2500.0}))
+    assert words(found) == ["same", "not yet run", "same", *["not yet run"] * 6]
+    levels = {"ant-4x2-matd3": 2000.0, "humanoid-9_8-matd3": 500.0, "humanoid-9_8-maddpg": 600.0}
+    table = table_of(robots, levels)
+    assert words(robots.claims(table)) == ["opposite", *["not yet run"] * 7, "opposite"]
+    lines = robots.details(table)
+    assert lines[2].startswith("| ant | 4x2 | MATD3 | 4 |") and lines[2].endswith(
+        "| 2,700 at 1M, 3,800 at 2M, 5,700 at 10M |"
+    )
+    assert lines[3].startswith("| humanoid | 9\\|8 | MATD3 |")
