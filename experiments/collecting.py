@@ -50,21 +50,36 @@ class Data:
         return {int(seed) for seed in self.rows[label].values("seed")} if label in self.rows else set()
 
     def offer(self, label: str, rows: Table, facts: dict[str, Any]) -> bool:
-        """Replace the rows and facts of a setting by these, unless these are better: finished where the new ones
-        are not, or of the same settings with more seeds. Whether they were taken."""
+        """Take the rows and facts of a setting. Whether they were taken.
+
+        Unfinished ones do not take the place of finished ones. Seeds of the settings that are there already join them;
+        of other settings take their place.
+        """
         if label in self.rows and not self.unfinished(label):
-            same = not differences(self.facts[label]["settings"], facts["settings"])
-            if facts["summary"] == UNFINISHED or same and len(rows.values("seed")) < len(self.seeds(label)):
+            if facts["summary"] == UNFINISHED:
                 return False
+            there = self.seeds(label)
+            if not differences(self.facts[label]["settings"], facts["settings"]):
+                new = {int(seed) for seed in rows.values("seed")} - there
+                if not new:
+                    return False
+                rows = tidy.concatenate([self.rows[label], rows.take(np.isin(rows["seed"], list(new)))])
+                facts = joined([self.facts[label], {**facts, "parts": _only(facts, new)}], there | new)
         self.rows[label], self.facts[label] = rows, facts
         return True
 
     def has(self, label: str, wanted: Config) -> bool:
         """Whether there are finished data of these settings with all these seeds."""
+        return not self.missing(label, wanted)
+
+    def missing(self, label: str, wanted: Config) -> list[int]:
+        """The seeds of these settings of which there are no finished data."""
+        asked = range(wanted.seed, wanted.seed + wanted.seeds)
         if label not in self.rows or self.unfinished(label):
-            return False
-        asked = set(range(wanted.seed, wanted.seed + wanted.seeds))
-        return not differences(self.facts[label]["settings"], wanted.to_dict()) and asked <= self.seeds(label)
+            return [*asked]
+        if differences(self.facts[label]["settings"], wanted.to_dict()):
+            return [*asked]
+        return [seed for seed in asked if seed not in self.seeds(label)]
 
 
 def read(table: Path, facts: Path, keys: Mapping[str, str]) -> Data:
@@ -145,25 +160,59 @@ def gather(keys: Mapping[str, str], paths: Sequence[Path], command: str, **how: 
 
     how: `keep`, `points` and `evaluations` of `tidy.from_metrics`.
     """
-    parts, facts, seeds = [], [], set[int]()
+    rows, facts, seeds = [], [], set[int]()
     for path in paths:
         run, settings = RunDirectory.open(path)
-        part = tidy.from_metrics(run.read_metrics(), key_values(keys, settings.to_dict()), **how)
-        part = part.take(~np.isin(part["seed"], list(seeds)))
-        seeds |= {int(seed) for seed in part.values("seed")}
-        parts.append(part)
+        table = tidy.from_metrics(run.read_metrics(), key_values(keys, settings.to_dict()), **how)
+        table = table.take(~np.isin(table["seed"], list(seeds)))
+        own = {int(seed) for seed in table.values("seed")}
+        seeds |= own
+        rows.append(table)
         summary = path / "summary.json"
-        facts.append(
-            {
-                "command": command,
-                "settings": {k: v for k, v in settings.to_dict().items() if k not in ("out", "name")},
-                "machine": json.loads((path / "machine.json").read_text(encoding="utf-8")),
-                "summary": json.loads(summary.read_text(encoding="utf-8")) if summary.exists() else UNFINISHED,
-            }
-        )
-    whole = facts[0]
-    if len(facts) > 1:
-        summaries = [fact["summary"] for fact in facts]
-        whole["summary"] = UNFINISHED if UNFINISHED in summaries else {"parts": summaries}
-        whole["settings"] = {**whole["settings"], "seed": min(seeds), "seeds": len(seeds)}
-    return tidy.concatenate(parts), whole
+        fact = {
+            "command": command,
+            "settings": {k: v for k, v in settings.to_dict().items() if k not in ("out", "name")},
+            "machine": json.loads((path / "machine.json").read_text(encoding="utf-8")),
+            "summary": json.loads(summary.read_text(encoding="utf-8")) if summary.exists() else UNFINISHED,
+        }
+        facts.append({**fact, "parts": _only(fact, own)})
+    return tidy.concatenate(rows), joined(facts, seeds) if len(facts) > 1 else _without_parts(facts[0])
+
+
+PART = ("command", "machine", "summary")
+"""What may differ between seeds of one setting that were trained apart."""
+
+
+def parts_of(fact: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Which seeds of a setting were trained together, with `PART` of each."""
+    if "parts" in fact:
+        return fact["parts"]
+    first, number = fact["settings"]["seed"], fact["settings"]["seeds"]
+    summaries = fact["summary"].get("parts") if isinstance(fact["summary"], dict) else None
+    if summaries is None:
+        return [{"seeds": [*range(first, first + number)], **{key: fact[key] for key in PART}}]
+    # Of older data only the number of seeds is known, of which the parts have about as many each.
+    ends = [first + number * k // len(summaries) for k in range(len(summaries) + 1)]
+    pairs = zip(ends, ends[1:], summaries, strict=False)
+    return [{"seeds": [*range(a, b)], **{key: fact[key] for key in PART}, "summary": one} for a, b, one in pairs]
+
+
+def joined(facts: Sequence[Mapping[str, Any]], seeds: set[int]) -> dict[str, Any]:
+    """The facts of one setting whose `seeds` were trained apart."""
+    parts = [part for fact in facts for part in parts_of(fact) if part["seeds"]]
+    summaries = [part["summary"] for part in parts]
+    summary = UNFINISHED if UNFINISHED in summaries else {"parts": summaries}
+    settings = {**facts[0]["settings"], "seed": min(seeds), "seeds": len(seeds)}
+    return {**facts[0], "settings": settings, "summary": summary, "parts": parts}
+
+
+def _only(fact: Mapping[str, Any], seeds: set[int]) -> list[dict[str, Any]]:
+    """The parts of a setting with no other seeds than these."""
+    parts = parts_of(fact)
+    if len(parts) == 1:
+        return [{**parts[0], "seeds": sorted(seeds)}]
+    return [{**part, "seeds": [seed for seed in part["seeds"] if seed in seeds]} for part in parts]
+
+
+def _without_parts(fact: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in fact.items() if key != "parts"}

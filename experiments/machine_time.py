@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from experiments import collecting
 from experiments.collecting import UNFINISHED
 
 
@@ -10,8 +11,8 @@ def lines(facts: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """A Markdown table of the finished settings; runs that were trained side by side share their hours by seeds."""
     rows: dict[tuple[str, ...], list[tuple[int, float]]] = {}
     for fact in facts.values():
-        for seeds, steps, seconds in _parts(fact):
-            rows.setdefault(_machine(fact["machine"]), []).append((seeds * steps, seconds))
+        for machine, seeds, steps, seconds in _parts(fact):
+            rows.setdefault(_machine(machine), []).append((seeds * steps, seconds))
     if not rows:
         return []
     table = ["| machine | jax | env steps of all seeds | hours | env steps/s |", "|---" * 5 + "|"]
@@ -23,20 +24,16 @@ def lines(facts: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 def hours(facts: Mapping[str, Mapping[str, Any]]) -> float:
     """Of all finished settings, on whatever machine."""
-    return sum(seconds for fact in facts.values() for _, _, seconds in _parts(fact)) / 3600
+    return sum(seconds for fact in facts.values() for *_, seconds in _parts(fact)) / 3600
 
 
-def _parts(fact: Mapping[str, Any]) -> Iterator[tuple[int, int, float]]:
-    """(seeds, env steps of each, seconds that count for them) of a setting's runs."""
-    summary = fact["summary"]
-    if summary == UNFINISHED:
-        return
-    parts = summary.get("parts", [summary])
-    for part in parts:
-        if "seconds" in part:
-            seeds = fact["settings"]["seeds"] // len(parts)
-            together = part.get("side_by_side", seeds)
-            yield seeds, part["total_steps"], part["seconds"] * seeds / max(together, seeds)
+def _parts(fact: Mapping[str, Any]) -> Iterator[tuple[Mapping[str, Any], int, int, float]]:
+    """(machine, seeds, env steps of each, seconds that count for them) of a setting's runs."""
+    for part in collecting.parts_of(fact) if fact["summary"] != UNFINISHED else ():
+        summary, seeds = part["summary"], len(part["seeds"])
+        if "seconds" in summary:
+            together = summary.get("side_by_side", seeds)
+            yield part["machine"], seeds, summary["total_steps"], summary["seconds"] * seeds / max(together, seeds)
 
 
 def _machine(facts: Mapping[str, Any]) -> tuple[str, str]:

@@ -24,7 +24,7 @@ from matd3_jax.config import Config
 from matd3_jax.errors import UserError
 from matd3_jax.runs.paths import check_directory
 from matd3_jax.runtime import devices, files
-from matd3_jax.sweep import runner
+from matd3_jax.sweep import batching, runner
 from matd3_jax.sweep.runner import Stopped
 
 RESULTS = Path(__file__).parent / "results"
@@ -46,6 +46,11 @@ class StudyOptions:
     only: str | None = option(
         "train only the settings whose names match, for instance only='*maddpg*'", default=None, metavar="PATTERN"
     )
+    at_once: int | None = option(
+        "seeds of each setting that are trained, and their data written, before the next ones; what a stop loses is "
+        "no more than that",
+        default=None, least=1, otherwise="all",
+    )  # fmt: skip
     runs: Path | None = option("run directories", default=None, otherwise="runs/experiments/NAME, or NAME_small")
     out: Path | None = option(
         "data, figure and table", default=None, otherwise="experiments/results/NAME, or NAME_small"
@@ -129,7 +134,7 @@ class Plan:
         folder: of the run directories.
         out: where the results are.
         wanted: the settings by label.
-        missing: those of them that are to be trained.
+        missing: what of them is to be trained: by name of a run (label, seeds) the label and the settings.
     """
 
     options: Any
@@ -137,7 +142,22 @@ class Plan:
     out: Path
     data: Data
     wanted: dict[str, Config]
-    missing: dict[str, Config]
+    missing: dict[str, tuple[str, Config]]
+
+    @property
+    def settings(self) -> dict[str, Config]:
+        """Of all runs that are missing, by name."""
+        return {name: settings for name, (_, settings) in self.missing.items()}
+
+    def rounds(self) -> list[dict[str, Config]]:
+        """The missing runs by what is trained one after the other: of each setting one."""
+        found: list[dict[str, Config]] = []
+        number: dict[str, int] = {}
+        for name, (label, settings) in self.missing.items():
+            number[label] = number.get(label, -1) + 1
+            found += [{}] if number[label] == len(found) else []
+            found[number[label]][name] = settings
+        return found
 
     @classmethod
     def of(cls, study: Study, argv: Sequence[str]) -> "Plan":
@@ -151,16 +171,28 @@ class Plan:
         lines = {label: _merged(line, overrides) for label, line in _checked(study, options, overrides).items()}
         wanted = {label: _load(tuple(line)) for label, line in lines.items()}
         data = collecting.read(*_files(study, out), study.keys)
-        missing = {}
+        missing: dict[str, tuple[str, Config]] = {}
         if options.train:
             chosen = [label for label in lines if fnmatch.fnmatch(label, options.only or "*")]
             if not chosen:
                 raise UserError(f"only={options.only}: matches none of {', '.join(lines)}")
-            missing = {label: wanted[label] for label in chosen if not data.has(label, wanted[label])}
-            for label in missing:
-                if (folder / "runs" / label / "config.yaml").exists():
-                    collecting.check(folder / "runs" / label, wanted[label])
+            for label in chosen:
+                missing |= _runs(label, wanted[label], data, options.at_once)
+            for name, (_, settings) in missing.items():
+                if (folder / "runs" / name / "config.yaml").exists():
+                    collecting.check(folder / "runs" / name, settings)
         return cls(options, folder, out, data, wanted, missing)
+
+
+def _runs(label: str, wanted: Config, data: Data, at_once: int | None) -> dict[str, tuple[str, Config]]:
+    """What is to be trained of a setting: by name its label and settings with some of the seeds."""
+    most, found = at_once or wanted.seeds, {}
+    for begin, length in batching.consecutive(data.missing(label, wanted), wanted.seeds):
+        for first in range(begin, begin + length, most):
+            number = min(most, begin + length - first)
+            name = label if number == wanted.seeds else f"{label}-seeds_{first}_to_{first + number - 1}"
+            found[name] = label, dataclasses.replace(wanted, seed=first, seeds=number)
+    return found
 
 
 def _files(study: Study, out: Path) -> tuple[Path, Path]:
@@ -170,9 +202,9 @@ def _files(study: Study, out: Path) -> tuple[Path, Path]:
 def estimate(study: Study, argv: Sequence[str], estimator: Estimator) -> tuple[int, float]:
     """Print what a call would train and how long it would take; (env steps of all seeds, seconds). Writes nothing."""
     plan = Plan.of(study, argv)
-    finished = len(plan.wanted) - len(plan.missing)
-    print(f"{study.title}: {len(plan.missing)} of {len(plan.wanted)} settings to train, {finished} not")
-    return estimating.report(estimating.planned(plan.missing, plan.folder), estimator)
+    left = len({label for label, _ in plan.missing.values()})
+    print(f"{study.title}: {left} of {len(plan.wanted)} settings to train, {len(plan.wanted) - left} not")
+    return estimating.report(estimating.planned(plan.settings, plan.folder), estimator)
 
 
 def run(study: Study, argv: Sequence[str]) -> list[Claim] | None:
@@ -182,22 +214,26 @@ def run(study: Study, argv: Sequence[str]) -> list[Claim] | None:
     """
     plan = Plan.of(study, argv)
     data, out, files = plan.data, plan.out, _files(study, plan.out)
-    paths = runner.train(plan.missing, plan.folder) if plan.options.train else {}
-    changed = False
-    for label, settings in plan.wanted.items():
-        if data.has(label, settings):
-            continue
-        found = paths.get(label) or collecting.find(plan.folder, label, settings)
-        if found:
-            command = line_to_copy(f"experiments.{study.name}", *_recorded(argv))
-            how = {"keep": study.keep, "points": study.points, "evaluations": study.evaluations}
-            changed |= data.offer(label, *collecting.gather(study.keys, found, command, **how))
+    command = line_to_copy(f"experiments.{study.name}", *_recorded(argv))
+    how = {"keep": study.keep, "points": study.points, "evaluations": study.evaluations}
+
+    def offer(label: str, found: Sequence[Path]) -> bool:
+        return bool(found) and data.offer(label, *collecting.gather(study.keys, found, command, **how))
+
+    def write() -> None:
+        out.mkdir(parents=True, exist_ok=True)
+        collecting.write(data, *files)
+
+    for settings in plan.rounds():
+        trained = runner.train(settings, plan.folder)
+        if any([offer(plan.missing[name][0], paths) for name, paths in trained.items()]):
+            write()
+    others = {label: settings for label, settings in plan.wanted.items() if not data.has(label, settings)}
+    if any([offer(label, collecting.find(plan.folder, label, one)) for label, one in others.items()]):
+        write()
+    data = collecting.read(*files, study.keys)  # the report is made of what is written
     if not data.rows:
         return None
-    out.mkdir(parents=True, exist_ok=True)
-    if changed:
-        collecting.write(data, *files)
-        data = collecting.read(*files, study.keys)
     return report(study, data, out, plan.options)
 
 

@@ -107,14 +107,46 @@ def test_finished_data_are_used_and_only_what_is_missing_is_trained(tmp_path, tr
     assert target_smoothing.main([*argv, "seeds=4"]) == 0
     assert [list(settings) for settings in trained] == [["sigma0.4"]]
     assert target_smoothing.main([*argv, "seeds=3", "only=sigma0.1"]) == 0
-    assert trained[1] == {}  # three of four seeds: enough
+    assert not trained[1:]  # three of four seeds: enough
     target_smoothing.main([*argv, "seeds=5", "only=sigma0.1"])
     target_smoothing.main([*argv, "seeds=4", "only=sigma0.2", "total_steps=200000"])
-    assert [list(settings) for settings in trained[2:]] == [["sigma0.1"], ["sigma0.2"]]
-    assert trained[3]["sigma0.2"].total_steps == 200_000 and trained[3]["sigma0.2"].algo.target_noise == 0.2
+    assert [list(settings) for settings in trained[1:]] == [["sigma0.1-seeds_4_to_4"], ["sigma0.2"]]
+    fifth = trained[1]["sigma0.1-seeds_4_to_4"]
+    assert (fifth.seed, fifth.seeds) == (4, 1)
+    assert trained[2]["sigma0.2"].total_steps == 200_000 and trained[2]["sigma0.2"].algo.target_noise == 0.2
     # Nothing came of it, and nothing was lost: four seeds of three settings, two rows each.
     with (out / "data.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 24
+
+
+def test_some_seeds_at_once_are_kept_when_the_next_ones_are_stopped(tmp_path, monkeypatch):
+    """Two of five seeds at a time, of two settings in turns; a stop in the second round costs that round alone."""
+    argv = ["only=simple_spread-*", "seeds=5", "at_once=2", f"runs={tmp_path / 'runs'}", f"out={tmp_path / 'out'}"]
+    rounds = []
+
+    def train(settings, folder):
+        rounds.append({name: (one.seed, one.seeds) for name, one in settings.items()})
+        if len(rounds) == 2:
+            raise runner.Stopped(130)
+        for name, one in settings.items():
+            line = cooperative.settings("paper", StudyOptions())[name.split("-seeds")[0]]
+            returns = {"return_agents": (np.zeros(one.seeds), 10.0 * (one.seed + np.arange(one.seeds)))}
+            fake_run(folder / "runs" / name, [t for t in line if "seeds" not in t], returns, first=one.seed)
+        return {name: [folder / "runs" / name] for name in settings}
+
+    monkeypatch.setattr(runner, "train", train)
+    assert cooperative.main(argv) == 130
+    assert cooperative.main(argv) == 0
+    names = [f"simple_spread-{algo}" for algo in ("matd3", "maddpg")]
+    first, stopped, second, third = rounds
+    assert first == {f"{name}-seeds_0_to_1": (0, 2) for name in names}
+    assert stopped == second == {f"{name}-seeds_2_to_3": (2, 2) for name in names}
+    assert third == {f"{name}-seeds_4_to_4": (4, 1) for name in names}
+    table = tidy.read(tmp_path / "out" / "data.csv").where(algo="maddpg")
+    np.testing.assert_allclose(tidy.final(table, "return_agents"), [0, 10, 20, 30, 40])
+    facts = json.loads((tmp_path / "out" / "runs.json").read_text())["simple_spread-maddpg"]
+    assert [part["seeds"] for part in facts["parts"]] == [[0, 1], [2, 3], [4]]
+    assert (facts["settings"]["seed"], facts["settings"]["seeds"]) == (0, 5)
 
 
 def test_unfinished_runs_are_drawn_but_claim_nothing(tmp_path):

@@ -11,16 +11,16 @@ NOISE = np.array([-1.0, 1.0, 0.5, -0.5])
 """Seeds about their mean."""
 
 
-def fake_run(path, overrides, columns, finished=True):
-    """A run directory of two rows (untrained, and 1,000 episodes later) for each seed.
+def fake_run(path, overrides, columns, finished=True, first=0):
+    """A run directory of two rows (untrained, and 1,000 episodes later) for each seed, from number `first` on.
 
     columns: name -> (values [seeds] of the first row, of the second).
     """
     seeds = len(next(iter(columns.values()))[0])
-    settings = config.load([*overrides, f"seeds={seeds}"])
+    settings = config.load([*overrides, f"seeds={seeds}", *([f"seed={first}"] if first else [])])
     run = RunDirectory.create(path, settings, {"cores": 2})
     for k, step in enumerate((25_000, 50_000)):
-        row = {"step": np.full(seeds, step), "seed": np.arange(seeds), "updates": np.full(seeds, 250 * k)}
+        row = {"step": np.full(seeds, step), "seed": first + np.arange(seeds), "updates": np.full(seeds, 250 * k)}
         row |= {"episodes": np.full(seeds, 1000), "episode_length": np.full(seeds, 25.0)}
         run.append(row | {name: np.asarray(values[k], float) for name, values in columns.items()})
     if finished:
