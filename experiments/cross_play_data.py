@@ -101,6 +101,37 @@ def write(tasks: Mapping[str, Task], table: Path, facts: Path) -> None:
     files.write_json(facts, {env: task.facts for env, task in tasks.items()})
 
 
+def of_command(folder: Path, side: int) -> Task:
+    """What `python -m matd3_jax.crossplay` left in `folder` of the four pairings of a task.
+
+    Args:
+        side: 0 where the team are the agents, 1 where it is the adversaries.
+
+    Raises UserError where it is damaged, or of other runs.
+    """
+    sides = ("agents", "adversaries") if side == 0 else ("adversaries", "agents")
+    try:
+        kept = json.loads((folder / "crossplay.json").read_text(encoding="utf-8"))
+        pairing = {
+            name: PAIRINGS.index((run["algorithms"][sides[0]], run["algorithms"][sides[1]]))
+            for name, run in kept["runs"].items()
+        }
+        if sorted(pairing.values()) != list(range(len(PAIRINGS))):
+            raise ValueError("not one run of each pairing")
+        numbers = {name: run["seeds"] for name, run in kept["runs"].items()}
+        with (folder / "pairs.csv").open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+        runs = [[pairing[row[who]] for who in sides] for row in rows]
+        seeds = [[numbers[row[who]].index(int(row[f"{who}_seed"])) for who in sides] for row in rows]
+        returns = [float(row[f"return_{sides[0]}"]) for row in rows]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"cannot read {folder} as a cross-play of the four pairings: {error!r}") from error
+    named = {"-vs-".join(PAIRINGS[pairing[name]]): run for name, run in kept["runs"].items()}
+    facts = {"episodes": kept["episodes"], "deterministic": kept["deterministic"]}
+    ours = {name: {key: run[key] for key in ("checkpoint", "seeds")} for name, run in named.items()}
+    return Task({**facts, "runs": ours}, np.array(runs), np.array(seeds), np.array(returns))
+
+
 def read(table: Path, facts: Path) -> dict[str, Task]:
     """What `write` left, by task; nothing if there are no such files. Raises UserError if they are damaged."""
     if not (table.exists() and facts.exists()):
