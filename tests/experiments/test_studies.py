@@ -57,7 +57,7 @@ def delay_table(levels, spreads, adversary):
 
 
 def test_quick_targets():
-    """Targets move by the same share for each update whatever the delay, in both teams; otherwise tau is the paper's."""
+    """Targets move by the same share for each update whatever the delay, in both teams."""
     plain, quick = (
         {label: config.load(line) for label, line in policy_delay.settings("paper", options).items()}
         for options in (policy_delay.DelayOptions(), policy_delay.DelayOptions(quick_targets=True))
