@@ -47,10 +47,15 @@ class Task:
     def contrast(self, plus: Sequence[tuple[str, str]], minus: Sequence[tuple[str, str]]) -> tuple[float, float]:
         """Mean over `plus` less mean over `minus`, of strangers: (difference, half width of its 95 % interval).
 
-        Both must have equally many cells: the difference is then twice the mean of the cells with their signs.
+        With equally many cells on both sides the difference is twice the mean of the cells with their signs; otherwise
+        (so few seeds that there are no strangers in a cell) there is no interval: nan.
         """
         first, second = ([cell for pair in pairs for cell in self._cells(pair, False)] for pairs in (plus, minus))
-        assert len(first) == len(second)
+        if len(first) != len(second) or not first:
+            means = [
+                np.mean([self.returns[cell].mean() for cell in side]) if side else np.nan for side in (first, second)
+            ]
+            return float(means[0] - means[1]), np.nan
         signed = self.returns.copy()
         signed[np.concatenate(second)] *= -1
         mean = self._pairings(2 * signed).mean([*first, *second])
@@ -58,9 +63,13 @@ class Task:
         return float(mean.value[0]), float(mean.half[0])
 
     def matrix(self) -> np.ndarray:
-        """[pairings, pairings] mean returns of the team between strangers, rows by the team's pairing."""
-        numbers = range(len(PAIRINGS))
-        return np.array([[self.returns[self._rows(i, j, False)].mean() for j in numbers] for i in numbers])
+        """[pairings, pairings] mean returns of the team between strangers, rows by the team's pairing; nan without."""
+        found = np.full((len(PAIRINGS), len(PAIRINGS)), np.nan)
+        for i, j in np.ndindex(found.shape):
+            rows = self._rows(i, j, False)
+            if len(rows):
+                found[i, j] = self.returns[rows].mean()
+        return found
 
     def _cells(self, pair: tuple[str, str], own: bool) -> list[np.ndarray]:
         """The rows of each two runs whose team and opponent have these algorithms."""

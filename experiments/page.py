@@ -128,9 +128,13 @@ def strangers(results: Path) -> list[Entry]:
     folder = results / "competitive"
     tasks = cross_play_data.read(*(folder / name for name in cross_play.FILES))
     found = []
-    for claim in cross_play.claims(tasks):
-        if claim.difference is not None:
-            found.append(Entry("cross_play", claim.paper, claim, "see the table", False, folder, "cross_play.png"))
+    for env in tasks:
+        runs = tasks[env].facts["runs"].values()
+        size = f"{_range([len(run['seeds']) for run in runs])} seeds of each pairing x "
+        size += f"{_millions([run['checkpoint'] for run in runs])} million env steps"
+        for claim in cross_play.claims({env: tasks[env]}):
+            if claim.difference is not None:
+                found.append(Entry("cross_play", claim.paper, claim, size, False, folder, "cross_play.png"))
     return found
 
 

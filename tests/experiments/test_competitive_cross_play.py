@@ -108,6 +108,18 @@ def test_means_and_contrasts():
     assert matrix[2, 2] == pytest.approx(-4)
 
 
+def test_one_seed_has_no_intervals():
+    """Where everybody's only partner is their own there are no strangers in a cell; nothing is claimed."""
+    task = made_up(lambda i, j, k, m: 10.0 * i)
+    few = (task.seeds == 0).all(axis=1)
+    task = Task(task.facts, task.runs[few], task.seeds[few], task.returns[few])
+    value, half = task.contrast([("matd3", "maddpg")], [("maddpg", "matd3")])
+    assert np.isfinite(value) and np.isnan(half)
+    assert np.isnan(np.diag(task.matrix())).all() and task.matrix()[3, 0] == 30
+    claims = cross_play.claims({"simple_tag": task})
+    assert [claim.verdict for claim in claims] == ["not yet run"] * 6 + ["not shown"] * 2
+
+
 def test_data_are_read_as_they_were_written(tmp_path):
     task = made_up(lambda i, j, k, m: 1000 * i + 100 * j + 10 * k + m)
     sound = ~((task.runs[:, 0] == 1) & (task.seeds[:, 0] == 2))  # a seed that diverged
