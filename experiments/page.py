@@ -93,7 +93,8 @@ def main(argv: Sequence[str]) -> int:
     }
     for name, lines in blocks.items():
         text = replaced(text, name, lines, options.page)
-    claims_figure.draw([(e.study, e.short, e.claim, e.small) for e in paper], options.figure)
+    if any(entry.folder for entry in paper):
+        claims_figure.draw([(e.study, e.short, e.claim, e.small) for e in paper], options.figure)
     files.write_text(options.page, text)
     print(f"{counts(paper, hours)}\npage: {options.page}\nfigure: {options.figure}")
     return 0
