@@ -3,7 +3,8 @@
 After `python -m experiments.competitive`: in each task the teams of all four pairings play the single agents of all
 four, every seed against every seed. Pairs that were trained together stand apart. The table has the team's return for
 each algorithm of the team and of the single agent, and what the algorithms make of it. Goes by task: what was played
-with the same checkpoints is used as it is, so a call that was stopped resumes with the same command.
+with the same checkpoints is used as it is, so a call that was stopped resumes with the same command. What
+`matd3_jax.crossplay` left of a task's four pairings in `out`/cross_play_TASK is taken, too.
 """
 
 import dataclasses
@@ -18,7 +19,7 @@ from rich.progress import track
 
 from experiments import figures, verdict
 from experiments.competitive import ALGOS, ENVS, PAIRINGS, team_is_adversaries
-from experiments.cross_play_data import Task, read, write
+from experiments.cross_play_data import Task, of_command, read, write
 from experiments.study import RESULTS
 from experiments.verdict import Claim, Difference
 from matd3_jax.cli import command
@@ -70,11 +71,17 @@ def main(argv: Sequence[str]) -> int:
     devices.prepare()
     where = tuple(out / file for file in FILES)
     tasks = read(*where)
+    for env in ENVS:
+        played = out / f"cross_play_{env}"
+        if env not in tasks and played.is_dir():
+            tasks[env] = of_command(played, int(team_is_adversaries(env)))
+            write(tasks, *where)
     runs = run_directories(folder) if options.play else {}
     for env in chosen if options.play else ():
         missing = [" against ".join(figures.NAMES[algo] for algo in pair) for pair in PAIRINGS if pair not in runs[env]]
         if missing:
-            print(f"{env}: not played, for in {folder} there is no finished run of {', '.join(missing)}")
+            if env not in tasks:
+                print(f"{env}: not played, for in {folder} there is no finished run of {', '.join(missing)}")
             continue
         own = {pair: runs[env][pair] for pair in PAIRINGS}
         facts = planned(own, options)
@@ -204,15 +211,15 @@ def report(tasks: Mapping[str, Task], out: Path) -> None:
         "share a seed are not independent; there are no p-values.",
         "",
     ]
+    sizes: dict[str, list[str]] = {}
     for env, task in tasks.items():
         kind = "deterministic" if task.facts["deterministic"] else "sampled"
         runs = task.facts["runs"].values()
         seeds = "/".join(sorted({str(len(run["seeds"])) for run in runs}))
         steps = "/".join(sorted({f"{run['checkpoint']:,}" for run in runs}))
-        lines.append(
-            f"{figures.task(env)}: {seeds} seeds of each pairing after {steps} env steps, "
-            f"{task.facts['episodes']} {kind} episodes of each pair.\n"
-        )
+        size = f"{seeds} seeds of each pairing after {steps} env steps, {task.facts['episodes']} {kind} episodes"
+        sizes.setdefault(f"{size} of each pair.", []).append(figures.task(env))
+    lines += [line for size, names in sizes.items() for line in (f"{', '.join(names)}: {size}", "")]
     lines += [*verdict.lines(claims(tasks)), "", verdict.DEFINITIONS, ""]
     lines += ["| task | team | single agent | own partner | strangers | pairs of strangers |", "|---" * 6 + "|"]
     for env, task in tasks.items():

@@ -47,10 +47,15 @@ class Task:
     def contrast(self, plus: Sequence[tuple[str, str]], minus: Sequence[tuple[str, str]]) -> tuple[float, float]:
         """Mean over `plus` less mean over `minus`, of strangers: (difference, half width of its 95 % interval).
 
-        Both must have equally many cells: the difference is then twice the mean of the cells with their signs.
+        With equally many cells on both sides the difference is twice the mean of the cells with their signs; otherwise
+        (so few seeds that there are no strangers in a cell) there is no interval: nan.
         """
         first, second = ([cell for pair in pairs for cell in self._cells(pair, False)] for pairs in (plus, minus))
-        assert len(first) == len(second)
+        if len(first) != len(second) or not first:
+            means = [
+                np.mean([self.returns[cell].mean() for cell in side]) if side else np.nan for side in (first, second)
+            ]
+            return float(means[0] - means[1]), np.nan
         signed = self.returns.copy()
         signed[np.concatenate(second)] *= -1
         mean = self._pairings(2 * signed).mean([*first, *second])
@@ -58,9 +63,13 @@ class Task:
         return float(mean.value[0]), float(mean.half[0])
 
     def matrix(self) -> np.ndarray:
-        """[pairings, pairings] mean returns of the team between strangers, rows by the team's pairing."""
-        numbers = range(len(PAIRINGS))
-        return np.array([[self.returns[self._rows(i, j, False)].mean() for j in numbers] for i in numbers])
+        """[pairings, pairings] mean returns of the team between strangers, rows by the team's pairing; nan without."""
+        found = np.full((len(PAIRINGS), len(PAIRINGS)), np.nan)
+        for i, j in np.ndindex(found.shape):
+            rows = self._rows(i, j, False)
+            if len(rows):
+                found[i, j] = self.returns[rows].mean()
+        return found
 
     def _cells(self, pair: tuple[str, str], own: bool) -> list[np.ndarray]:
         """The rows of each two runs whose team and opponent have these algorithms."""
@@ -99,6 +108,37 @@ def write(tasks: Mapping[str, Task], table: Path, facts: Path) -> None:
                     rows.append((env, *team, *reversed(single), seed, *(cells.get(number, "") for number in columns)))
     files.write_csv(table, rows, line_end="\n")
     files.write_json(facts, {env: task.facts for env, task in tasks.items()})
+
+
+def of_command(folder: Path, side: int) -> Task:
+    """What `python -m matd3_jax.crossplay` left in `folder` of the four pairings of a task.
+
+    Args:
+        side: 0 where the team are the agents, 1 where it is the adversaries.
+
+    Raises UserError where it is damaged, or of other runs.
+    """
+    sides = ("agents", "adversaries") if side == 0 else ("adversaries", "agents")
+    try:
+        kept = json.loads((folder / "crossplay.json").read_text(encoding="utf-8"))
+        pairing = {
+            name: PAIRINGS.index((run["algorithms"][sides[0]], run["algorithms"][sides[1]]))
+            for name, run in kept["runs"].items()
+        }
+        if sorted(pairing.values()) != list(range(len(PAIRINGS))):
+            raise ValueError("not one run of each pairing")
+        numbers = {name: run["seeds"] for name, run in kept["runs"].items()}
+        with (folder / "pairs.csv").open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+        runs = [[pairing[row[who]] for who in sides] for row in rows]
+        seeds = [[numbers[row[who]].index(int(row[f"{who}_seed"])) for who in sides] for row in rows]
+        returns = [float(row[f"return_{sides[0]}"]) for row in rows]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"cannot read {folder} as a cross-play of the four pairings: {error!r}") from error
+    named = {"-vs-".join(PAIRINGS[pairing[name]]): run for name, run in kept["runs"].items()}
+    facts = {"episodes": kept["episodes"], "deterministic": kept["deterministic"]}
+    ours = {name: {key: run[key] for key in ("checkpoint", "seeds")} for name, run in named.items()}
+    return Task({**facts, "runs": ours}, np.array(runs), np.array(seeds), np.array(returns))
 
 
 def read(table: Path, facts: Path) -> dict[str, Task]:

@@ -6,6 +6,7 @@ times the ratio of the floating point operations of their matrix products (`trai
 """
 
 import dataclasses
+import functools
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -43,6 +44,19 @@ class Batch:
     def seeds(self) -> int:
         return sum(member.seeds for member in self.members)
 
+    @functools.cached_property
+    def training(self) -> TrainingSession:
+        return TrainingSession(self.members[0], members=self.members)
+
+    @property
+    def env(self) -> str:
+        return str(self.members[0].env["name"])
+
+    @property
+    def flops(self) -> float:
+        """Of the matrix products of one env step of one seed."""
+        return cost.step_flops(self.training.layout, self.training.trainer.schedule)
+
 
 @dataclasses.dataclass(frozen=True)
 class Rate:
@@ -76,16 +90,14 @@ class Estimator:
             self._spent += time.perf_counter() - begun
         if key in self.rates:
             return self.rates[key].steps, True
-        env, flops = _env(batch), _flops(session(batch.members))
-        alike = [rate for rate in self.rates.values() if rate.env == env] or list(self.rates.values())
-        nearest = min(alike, key=lambda rate: abs(rate.flops - flops))
-        return nearest.steps * nearest.flops / flops, False
+        alike = [rate for rate in self.rates.values() if rate.env == batch.env] or list(self.rates.values())
+        nearest = min(alike, key=lambda rate: abs(rate.flops - batch.flops))
+        return nearest.steps * nearest.flops / batch.flops, False
 
 
 def measure(batch: Batch) -> Rate:
     """The rate of a batch's own program, of some `STEPS` env steps a call, while it learns."""
-    members = [_shortened(member) for member in batch.members]
-    training = session(members)
+    training = Batch([_shortened(member) for member in batch.members]).training
     trainer = training.trainer
     state, _ = trainer.warm_up(trainer.init(training.keys()))
     iterations = max(1, STEPS // trainer.iteration_steps)
@@ -97,11 +109,7 @@ def measure(batch: Batch) -> Rate:
         calls += 1
     taken = time.perf_counter() - begun
     steps = calls * iterations * trainer.iteration_steps * batch.seeds / taken
-    return Rate(_env(batch), _flops(training), steps)
-
-
-def session(members: Sequence[Config]) -> TrainingSession:
-    return TrainingSession(members[0], members=members)
+    return Rate(batch.env, batch.flops, steps)
 
 
 def planned(missing: Mapping[str, Config], folder: Path) -> list[Batch]:
@@ -127,10 +135,13 @@ def report(batches: Sequence[Batch], estimator: Estimator) -> tuple[int, float]:
     steps, seconds, most = 0, 0.0, 0
     order = sorted(batches, key=lambda batch: -_work(batch))
     # Measured first is what counts most of each environment; what counts least has to do without.
-    for batch in {_env(batch): batch for batch in reversed(order)}.values():
+    largest: dict[str, Batch] = {}
+    for batch in order:
+        largest.setdefault(batch.env, batch)
+    for batch in largest.values():
         estimator.rate(batch)
     for number, batch in enumerate(order, start=1):
-        training = session(batch.members)
+        training = batch.training
         rate, measured = estimator.rate(batch)
         left = training.total_steps - batch.done
         memory = needed(training.trainer, batch.seeds)
@@ -155,17 +166,8 @@ def report(batches: Sequence[Batch], estimator: Estimator) -> tuple[int, float]:
     return steps, seconds
 
 
-def _env(batch: Batch) -> str:
-    return str(batch.members[0].env["name"])
-
-
 def _work(batch: Batch) -> float:
-    training = session(batch.members)
-    return batch.seeds * (training.total_steps - batch.done) * _flops(training)
-
-
-def _flops(training: TrainingSession) -> float:
-    return cost.step_flops(training.layout, training.trainer.schedule)
+    return batch.seeds * (batch.training.total_steps - batch.done) * batch.flops
 
 
 def _shortened(config: Config) -> Config:

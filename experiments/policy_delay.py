@@ -2,18 +2,22 @@
 update.
 
 Figure 5 of the paper: Cooperative Navigation, and Covert Communication, where team and adversary have the same delay.
+A delay slows the targets, too, and with them the critics (`experiments.overestimation`): quick_targets=true gives them
+the same speed whatever the delay, and leaves slower policies alone.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from experiments import figures, study, tidy, verdict
-from experiments.study import Study, StudyOptions
+from experiments.study import RESULTS, Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
+from matd3_jax.cli.options import option
 from matd3_jax.figures.style import SERIES
 
 ENVS = ("simple_spread", "simple_crypto")
@@ -25,13 +29,28 @@ SCALES = {
 }
 
 
+@dataclasses.dataclass(frozen=True)
+class DelayOptions(StudyOptions):
+    """Options of this study."""
+
+    quick_targets: bool = option("true: tau 0.01 times the delay (not the paper's)", default=False)
+
+
 def settings(scale: str, options: StudyOptions) -> dict[str, list[str]]:
     common = [*SCALES[scale], "eval_every=0", "keep_checkpoints=1"]
+    quick = getattr(options, "quick_targets", False)
     return {
-        f"{env}-d{delay}": [f"env={env}", "algo=matd3", f"algo.policy_delay={delay}", *common]
+        f"{env}-d{delay}": [
+            f"env={env}", "algo=matd3", f"algo.policy_delay={delay}", *([f"algo.tau={0.01 * delay:g}"] * quick), *common
+        ]
         for env in ENVS
         for delay in DELAYS
-    }
+    }  # fmt: skip
+
+
+def folders(options: DelayOptions) -> tuple[Path, Path]:
+    name = "policy_delay" + "_quick_targets" * options.quick_targets + "_small" * (options.scale == "small")
+    return Path("runs/experiments") / name, RESULTS / name
 
 
 def claims(table: Table) -> list[Claim]:
@@ -111,6 +130,8 @@ STUDY = Study(
     keys={"env": "env.name", "policy_delay": "algo.policy_delay"},
     claims=claims,
     draw=draw,
+    options=DelayOptions,
+    folders=folders,
     details=lambda table: figures.finals_table(
         table,
         ("env", "policy_delay"),

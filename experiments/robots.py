@@ -80,7 +80,7 @@ def draw(table: Table, path: Path) -> None:
             part = _part(table, *key, algo)
             if len(part):
                 evaluations.draw(axis, part, evaluations.RETURN, figures.COLORS[algo], figures.NAMES[algo])
-        if key == ("ant", "4x2"):
+        if key == ("ant", "4x2") and table["step"].max() >= 0.9e6:
             axis.plot(1e6, HARL_ANT, "*", color="black", markersize=8, label="HARL's MATD3", zorder=5)
         axis.set_title(_title(*key))
         axis.legend(frameon=False, fontsize=8, loc="upper left")

@@ -252,8 +252,8 @@ def report(study: Study, data: Data, out: Path, options: StudyOptions) -> list[C
 def departures(study: Study, data: Data, options: StudyOptions) -> list[str]:
     """Lines on where what was run departs from the paper's protocol, and what is not finished."""
     lines: dict[str, list[str]] = {}
-    if hasattr(options, "env"):
-        options = dataclasses.replace(options, env=None)  # the paper's own environment
+    for name, value in (("env", None), ("quick_targets", False)):  # the paper's own
+        options = dataclasses.replace(options, **{name: value}) if hasattr(options, name) else options
     paper = study.settings("paper", options)
     for label, fact in data.facts.items():
         differences = []

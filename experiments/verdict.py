@@ -42,6 +42,8 @@ class Difference:
     low: float
     high: float
     p: float
+    unit: float = 0.0
+    """Standard deviation over seeds, in which differences of different things can be compared; 0: none."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,12 +86,14 @@ class Claim:
 
 def difference(a: np.ndarray, b: np.ndarray) -> Difference:
     """Mean of a [n] minus mean of b [m], seeds of two settings (Welch)."""
-    return _of(intervals.compare(a, b))
+    unit = np.sqrt((a.var(ddof=1) + b.var(ddof=1)) / 2) if min(len(a), len(b)) > 1 else 0.0
+    return _of(intervals.compare(a, b), unit)
 
 
 def mean(values: np.ndarray) -> Difference:
     """Mean of values [n] against zero (Student)."""
-    return _of(intervals.compare(values, np.zeros_like(values), paired=True))
+    unit = values.std(ddof=1) if len(values) > 1 else 0.0
+    return _of(intervals.compare(values, np.zeros_like(values), paired=True), unit)
 
 
 def correlation(x: np.ndarray, y: np.ndarray) -> Difference:
@@ -98,7 +102,7 @@ def correlation(x: np.ndarray, y: np.ndarray) -> Difference:
         return Difference(np.nan, np.nan, np.nan, np.nan)
     test = stats.pearsonr(x, y)
     low, high = test.confidence_interval(0.95) if len(x) > 3 else (np.nan, np.nan)
-    return Difference(float(test.statistic), float(low), float(high), float(test.pvalue))
+    return Difference(float(test.statistic), float(low), float(high), float(test.pvalue), unit=1.0)
 
 
 def slope(x: np.ndarray, y: np.ndarray) -> Difference:
@@ -107,12 +111,14 @@ def slope(x: np.ndarray, y: np.ndarray) -> Difference:
         return Difference(np.nan, np.nan, np.nan, np.nan)
     line = stats.linregress(x, y)
     half = float(stats.t.ppf(0.975, len(x) - 2)) * line.stderr
-    return Difference(line.slope, line.slope - half, line.slope + half, float(line.pvalue))
+    rest = y - line.intercept - line.slope * x
+    unit = float(np.sqrt((rest**2).sum() / (len(x) - 2)))
+    return Difference(line.slope, line.slope - half, line.slope + half, float(line.pvalue), unit)
 
 
 def negative(found: Difference) -> Difference:
     """The same difference the other way round."""
-    return Difference(-found.estimate, -found.high, -found.low, found.p)
+    return Difference(-found.estimate, -found.high, -found.low, found.p, found.unit)
 
 
 def spread(values: np.ndarray) -> np.ndarray:
@@ -132,8 +138,8 @@ def holm(p: Sequence[float]) -> list[float]:
     return found
 
 
-def _of(found: intervals.Comparison) -> Difference:
-    return Difference(*map(float, (found.difference, found.low, found.high, found.p)))
+def _of(found: intervals.Comparison, unit: float) -> Difference:
+    return Difference(*map(float, (found.difference, found.low, found.high, found.p, unit)))
 
 
 # ---- claims ----------------------------------------------------------------------------------------------------------
@@ -167,14 +173,18 @@ def lines(claims: Sequence[Claim]) -> list[str]:
     for i, claim in enumerate(claims):
         cells = [claim.paper, claim.quantity, claim.found or NOTHING, NOTHING, NOTHING, NOTHING, f"**{claim.verdict}**"]
         if claim.difference is not None:
-            d = claim.difference
-            cells[3] = f"{'+' * (d.estimate > 0)}{number(d.estimate)} ({_interval(d)})"
-            if claim.kind != "greater":
-                cells[3] += f"; margin {number(claim.margin)}"
-            cells[4] = _p(d.p)
+            cells[3], cells[4] = in_words(claim), _p(claim.difference.p)
             cells[5] = _p(corrected[i]) if i in corrected else NOTHING
         table.append(f"| {' | '.join(cells)} |")
     return table
+
+
+def in_words(claim: Claim) -> str:
+    """The difference of a claim that has one, with its interval and the claim's margin."""
+    d = claim.difference
+    assert d is not None
+    text = f"{'+' * (d.estimate > 0)}{number(d.estimate)} ({_interval(d)})"
+    return text if claim.kind == "greater" else f"{text}; margin {number(claim.margin)}"
 
 
 def _interval(d: Difference) -> str:

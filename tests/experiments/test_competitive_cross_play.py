@@ -49,17 +49,24 @@ def test_command(folder, tmp_path, monkeypatch, capsys, quick_jit):
     assert env == "simple_tag" and task.facts["runs"]["matd3-vs-maddpg"] == {"checkpoint": 100, "seeds": [0, 1, 2]}
     assert len(task.returns) == 16 * 9
     # The same pairs by the other command: MADDPG prey's run (algo=maddpg adversary=matd3) has a MATD3 team.
-    where = ",".join(str(folder / "runs" / f"simple_tag-{name}") for name in ("maddpg-vs-matd3", "matd3-vs-maddpg"))
-    assert crossplay.main([f"runs={where}", "episodes=3", "deterministic=true", f"out={tmp_path / 'other'}"]) == 0
-    with (tmp_path / "other" / "pairs.csv").open() as file:
+    other = tmp_path / "other" / "cross_play_simple_tag"
+    where = f"runs={folder / 'runs' / 'simple_tag-*'}"
+    assert crossplay.main([where, "episodes=3", "deterministic=true", f"out={other}"]) == 0
+    with (other / "pairs.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 4 * 9
+    assert len(rows) == 16 * 9
     for row in rows:
         # The label of a run is ENV-PREY-vs-PREDATORS, a pairing (predators, prey).
         pairs = [tuple(reversed(row[name].removeprefix("simple_tag-").split("-vs-"))) for name in SIDES]
         same = (task.runs == [competitive.PAIRINGS.index(pair) for pair in pairs]).all(axis=1)
         same &= (task.seeds == [int(row[f"{name}_seed"]) for name in SIDES]).all(axis=1)
         np.testing.assert_allclose(task.returns[same], [float(row["return_adversaries"])], rtol=1e-4, atol=1e-4)
+    # What that command left is taken as it is.
+    assert cross_play.main(["play=false", f"out={tmp_path / 'other'}"]) == 0
+    for name in ("cross_play.json", "cross_play.md"):
+        assert (tmp_path / "other" / name).read_text() == (tmp_path / "out" / name).read_text()
+    taken = cross_play_data.read(*(tmp_path / "other" / name for name in cross_play.FILES))["simple_tag"]
+    np.testing.assert_allclose(taken.returns, task.returns, rtol=1e-4)
     text = (tmp_path / "out" / "cross_play.md").read_text()
     assert "Predator-Prey: 3 seeds of each pairing after 100 env steps, 3 deterministic episodes" in text
     assert text.count("**not yet run**") == 6
@@ -101,6 +108,18 @@ def test_means_and_contrasts():
     assert matrix[2, 2] == pytest.approx(-4)
 
 
+def test_one_seed_has_no_intervals():
+    """Where everybody's only partner is their own there are no strangers in a cell; nothing is claimed."""
+    task = made_up(lambda i, j, k, m: 10.0 * i)
+    few = (task.seeds == 0).all(axis=1)
+    task = Task(task.facts, task.runs[few], task.seeds[few], task.returns[few])
+    value, half = task.contrast([("matd3", "maddpg")], [("maddpg", "matd3")])
+    assert np.isfinite(value) and np.isnan(half)
+    assert np.isnan(np.diag(task.matrix())).all() and task.matrix()[3, 0] == 30
+    claims = cross_play.claims({"simple_tag": task})
+    assert [claim.verdict for claim in claims] == ["not yet run"] * 6 + ["not shown"] * 2
+
+
 def test_data_are_read_as_they_were_written(tmp_path):
     task = made_up(lambda i, j, k, m: 1000 * i + 100 * j + 10 * k + m)
     sound = ~((task.runs[:, 0] == 1) & (task.seeds[:, 0] == 2))  # a seed that diverged
@@ -137,3 +156,12 @@ def test_two_runs_of_a_pairing_are_refused(folder, tmp_path):
     shutil.copytree(tmp_path / "simple_push", tmp_path / "runs" / "again")
     with pytest.raises(UserError, match="both have seed 0 of the same pairing"):
         cross_play.main([f"runs={tmp_path}", f"out={tmp_path / 'out'}"])
+
+
+def test_a_cross_play_of_other_runs_is_refused(tmp_path):
+    played = tmp_path / "cross_play_simple_push"
+    played.mkdir()
+    run = {"algorithms": {"agents": "matd3", "adversaries": "matd3"}, "checkpoint": 1, "seeds": [0]}
+    (played / "crossplay.json").write_text(json.dumps({"runs": {"one": run}, "episodes": 1, "deterministic": True}))
+    with pytest.raises(UserError, match="cannot read .*cross_play_simple_push .*not one run of each pairing"):
+        cross_play.main(["play=false", f"out={tmp_path}"])

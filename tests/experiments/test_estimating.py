@@ -38,10 +38,10 @@ def test_what_is_not_measured_is_scaled_by_its_products(monkeypatch):
 
     def measure(batch):
         measured.append(batch.members[0].name)
-        return Rate(str(batch.members[0].env["name"]), 1e6, 1000.0)
+        return Rate(batch.env, 1e6, 1000.0)
 
     monkeypatch.setattr(estimating, "measure", measure)
-    monkeypatch.setattr(estimating, "_flops", lambda training: 4e6)
+    monkeypatch.setattr(Batch, "flops", 4e6)
     one = Batch([config.load(["env=simple_spread", "name=one", *TINY])])
     two = Batch([config.load(["env=simple_spread", "name=two", "seeds=2", *TINY])])
     other = Batch([config.load(["env=simple_spread", "name=other", "algo.lr=0.5", *TINY])])
@@ -69,7 +69,7 @@ def test_begun_batches_are_resumed_and_new_ones_share_programs(tmp_path):
 
 def test_finished_settings_are_not_counted_and_all_adds_up(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(everything, "STUDIES", {s.STUDY.name: s.STUDY for s in (cooperative, target_smoothing)})
-    monkeypatch.setattr(estimating, "measure", lambda batch: Rate(estimating._env(batch), 1e6, 1000.0))
+    monkeypatch.setattr(estimating, "measure", lambda batch: Rate(batch.env, 1e6, 1000.0))
     out, runs = tmp_path / "out", tmp_path / "runs"
     for label, line in target_smoothing.settings("small", StudyOptions()).items():
         returns = {"return_agents": (NOISE, NOISE)}

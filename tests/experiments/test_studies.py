@@ -4,8 +4,17 @@ import numpy as np
 import pytest
 from study_cases import NOISE, table_of, verdicts
 
-from experiments import cooperative, grid_search, number_of_agents, overestimation, policy_delay, target_smoothing
+from experiments import (
+    cooperative,
+    grid_search,
+    number_of_agents,
+    overestimation,
+    policy_delay,
+    target_smoothing,
+    target_speed,
+)
 from experiments.tidy import Table
+from matd3_jax import config
 
 
 def cooperative_table(final, quick, noise=NOISE):
@@ -45,6 +54,20 @@ def delay_table(levels, spreads, adversary):
             "return_adversaries": [NOISE, adversary[d] + NOISE],
         }
     return table_of(settings)
+
+
+def test_quick_targets():
+    """Targets move by the same share for each update whatever the delay, in both teams."""
+    plain, quick = (
+        {label: config.load(line) for label, line in policy_delay.settings("paper", options).items()}
+        for options in (policy_delay.DelayOptions(), policy_delay.DelayOptions(quick_targets=True))
+    )
+    assert {one.algo.tau for one in plain.values()} == {0.01}
+    for one in quick.values():
+        for team in one.teams().values():
+            assert team.tau / team.policy_delay == pytest.approx(0.01)
+    folders = [policy_delay.folders(policy_delay.DelayOptions(quick_targets=q))[1].name for q in (False, True)]
+    assert folders == ["policy_delay", "policy_delay_quick_targets"]
 
 
 def test_policy_delay():
@@ -165,3 +188,30 @@ def test_grid_search(tmp_path):
     assert grid_search.details(made(30.0))[2].startswith("| 1 | 0.01 | 1000 | 2 | 4 | 30 ")
     grid_search.draw(made(30.0), tmp_path / "figure.png")
     assert grid_search.claims(Table({}))[0].verdict == "not yet run"
+
+
+def speed_table(first):
+    """1,000 episodes untrained, 5,000 at the level `first`, 4,000 at 100."""
+    return table_of(
+        {
+            tuple(zip(target_speed.KEYS, target_speed.SETTINGS[name], strict=True)): {
+                "return_agents": [-500 + NOISE, *[level + NOISE] * 5, *[100 + NOISE] * 4]
+            }
+            for name, level in first.items()
+        }
+    )
+
+
+def test_target_speed(tmp_path):
+    levels = {"MATD3": 10.0, "MATD3, tau 0.02": 50.0, "MATD3, no delay": 10.0, "MADDPG": 40.0, "MADDPG, tau 0.005": 9.0}
+    table = speed_table(levels)
+    for name, level in levels.items():
+        np.testing.assert_allclose(target_speed.early(target_speed.part(table, name)), level + NOISE)
+    found = target_speed.claims(table)
+    assert verdicts(found) == ["same", "same", "not shown", "same", "same"]
+    assert found[4].difference.estimate == pytest.approx(10 * 5 / 9)
+    target_speed.draw(table, tmp_path / "figure.png")
+    lines = target_speed.settings("paper", target_speed.StudyOptions())
+    assert [target_speed.study.key_values(target_speed.KEYS, line) for line in lines.values()] == [
+        dict(zip(target_speed.KEYS, values, strict=True)) for values in target_speed.SETTINGS.values()
+    ]
