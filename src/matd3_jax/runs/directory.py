@@ -18,6 +18,7 @@ from matd3_jax.config.diff import differing, learning, text
 from matd3_jax.errors import UserError
 from matd3_jax.runs import metrics_table
 from matd3_jax.runs.metrics_table import MetricsTable
+from matd3_jax.runs.missing import Expected
 from matd3_jax.runs.paths import check_directory
 from matd3_jax.runtime import files
 
@@ -147,15 +148,25 @@ class RunDirectory:
             path.unlink(missing_ok=True)
         shutil.rmtree(self.checkpoints, ignore_errors=True)
 
-    def cut(self, step: int) -> MetricsTable:
-        """Drop the rows after env step `step`, which will be written again, and the lines that are not whole: what the
-        table has then, and how many damaged lines it had."""
-        kept = self.table().until(step)
+    def cut(self, step: int, expected: Expected | None = None) -> list[str]:
+        """Drop the rows after env step `step`, which will be written again, and the lines that are not whole.
+
+        Args:
+            expected: of the table: gives it the columns of the rows to come.
+
+        Returns:
+            What the table lacks, a line for each kind of loss.
+        """
+        kept = self.table()
+        lines = [] if expected is None else [f"{self.metrics}: {line}" for line in expected.lines(kept, step)]
+        kept = kept.until(step)
+        if expected is not None:
+            kept = expected.seen(kept).with_columns(expected.columns)
         if kept.rows:
             files.write_text(self.metrics, kept.text())
         else:
             self.metrics.unlink(missing_ok=True)
-        return kept
+        return lines
 
     def table(self) -> MetricsTable:
         """The whole rows of the metrics table; none where there is no file."""
@@ -167,9 +178,12 @@ class RunDirectory:
         Raises UserError if there is none yet.
         """
         table = self.table()
-        if not table.rows:
+        columns = table.columns()
+        if not table.rows and not table.damaged:
             raise UserError(f"{self.path} has no metrics yet: its first row comes when learning starts")
-        return table.columns()
+        if not columns or not columns["step"].size:
+            raise UserError(f"no row of {self.metrics} can be read: it is damaged")
+        return columns
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         files.write_json(self.path / "summary.json", summary)

@@ -256,7 +256,8 @@ class Batch:
         state, done = checkpoint.restore(saved, self.training.trainer, self.training.share), int(saved.name)
         self.processes.barrier()
         for run, config, own in zip(self.runs, self.members, self.seeds, strict=True) if first else ():
-            run.cut(done)
+            for line in run.cut(done, self.training.expected_table(config)):
+                say(f"note: {line}")
             known = divergence.of_run(run, done)
             self.watch.diverged |= {own.start + seed - config.seed: found for seed, found in known.items()}
         if first:
@@ -266,10 +267,10 @@ class Batch:
 
     def _finish(self, state: TrainState, row: Row, facts: Mapping[str, Any]) -> None:
         """Leave each run as if it had been trained alone, but for its replay."""
-        trainer, share = self.training.trainer, self.training.share
+        trainer, share, done = self.training.trainer, self.training.share, int(row["step"][0])
         facts = {**facts, "side_by_side": share.total}
         for run, config, seeds in zip(self.runs, self.members, self.seeds, strict=True):
-            checkpoint.save(run.checkpoints, int(row["step"][0]), trainer, state, keep=1, seeds=seeds, share=share)
+            checkpoint.save(run.checkpoints, done, trainer, state, keep=1, seeds=seeds, share=share)
             if not self.processes.first:
                 continue
             diverged = {
@@ -277,7 +278,8 @@ class Batch:
                 for place, found in self.watch.diverged.items()
                 if seeds.start <= place < seeds.stop
             }
-            finish.finish(run, self.training.layout, str(config.name), config.diagnostics.q_bias, facts, diverged)
+            settings = str(config.name), config.diagnostics.q_bias
+            finish.finish(run, self.training.layout, *settings, done, facts, diverged)
 
     def _announce(self) -> None:
         training, config = self.training, self.members[0]

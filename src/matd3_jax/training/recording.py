@@ -180,7 +180,7 @@ class Recorder:
             if self.processes.first:
                 self.say(f"{directory.path} has come to its end; its figures and its summary are made")
                 self._notes(training, directory, done)
-                self._finish(training, directory, {}, watch)
+                self._finish(training, directory, done, {}, watch)
             return Recorded(directory, training, Outcome(state, row, None, watch.diverged))
         if self.processes.first:
             for line in announcement.first_lines(training, directory, done):
@@ -200,15 +200,8 @@ class Recorder:
 
     def _notes(self, training: TrainingSession, directory: RunDirectory, done: int) -> None:
         """Take the rows after env step `done` out of the metrics table, and say what it lacks."""
-        table = directory.cut(done)
-        if table.damaged:
-            plural = "s" * (table.damaged > 1)
-            self.say(f"note: {directory.metrics} had {table.damaged} damaged line{plural}, left out now")
-        first, interval = training.trainer.schedule.warmup_steps, training.interval_steps
-        gaps = table.gaps(first, done, interval, training.share.total)
-        if gaps:
-            shown = ", ".join(f"{a:,} and {b:,}" for a, b in gaps[:3]) + (", ..." if len(gaps) > 3 else "")
-            self.say(f"note: {directory.metrics} lacks rows between env steps {shown}")
+        for line in directory.cut(done, training.expected_table(training.config)):
+            self.say(f"note: {line}")
 
     def _to_the_end(
         self,
@@ -245,15 +238,19 @@ class Recorder:
         if self.processes.first:
             if outcome.finished:
                 rates = {} if progress is None else progress.rates()
-                self._finish(training, directory, {"seconds": round(time.monotonic() - begun, 1), **rates}, watch)
+                facts = {"seconds": round(time.monotonic() - begun, 1), **rates}
+                self._finish(training, directory, step, facts, watch)
             else:
                 title, diverged = announcement.title(training), self._by_number(training, watch)
                 finish.draw(directory, training.layout, title, settings.diagnostics.q_bias, diverged)
         return Recorded(directory, training, outcome)
 
-    def _finish(self, training: TrainingSession, directory: RunDirectory, facts: dict, watch: DivergenceLogger) -> None:
-        title, diverged = announcement.title(training), self._by_number(training, watch)
-        found = finish.finish(directory, training.layout, title, training.config.diagnostics.q_bias, facts, diverged)
+    def _finish(
+        self, training: TrainingSession, directory: RunDirectory, done: int, facts: dict, watch: DivergenceLogger
+    ) -> None:
+        diverged, with_q_bias = self._by_number(training, watch), training.config.diagnostics.q_bias
+        title = announcement.title(training)
+        found = finish.finish(directory, training.layout, title, with_q_bias, done, facts, diverged)
         for line in announcement.last_lines(training, directory, found, diverged):
             self.say(line)
 

@@ -19,6 +19,7 @@ from matd3_jax.envs.environment import Environment
 from matd3_jax.envs.wrappers.joint_team import JointTeam
 from matd3_jax.errors import UserError
 from matd3_jax.runs import overestimation
+from matd3_jax.runs.missing import Expected
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.training import memory
@@ -228,6 +229,11 @@ class TrainingSession:
         names += [f"{agent}_{name}" for name in LEARNING_COLUMNS for agent in agents]
         names += self.evaluation_columns(None)
         return names + (list(overestimation.columns(agents, None, 0)) if self.config.diagnostics.q_bias else [])
+
+    def expected_table(self, config: Config) -> Expected:
+        """What the metrics table of a member should have."""
+        seeds = range(config.seed, config.seed + config.seeds)
+        return Expected(self.columns, seeds, self.trainer.schedule.warmup_steps, self.interval_steps)
 
     def team_weights(self, team: str) -> np.ndarray:
         """Weights [agents] of the agents' returns in the number reported for a team (`Environment.return_weights`)."""
