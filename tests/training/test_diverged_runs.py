@@ -15,6 +15,7 @@ from matd3_jax.cli import evaluate, render, train
 from matd3_jax.errors import UserError
 from matd3_jax.stats.intervals import mean_interval
 from matd3_jax.training import checkpoint
+from matd3_jax.training.loggers import DivergenceLogger
 from matd3_jax.training.recording import Recorder
 from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import networks_finite
@@ -82,6 +83,26 @@ def test_a_seed_that_diverges_is_told_of_and_left_out(blown, tmp_path, monkeypat
     monkeypatch.undo()
     Recorder().start(config.load(SMALL), tmp_path / "sound")
     assert table(path) == table(tmp_path / "sound")
+
+
+def test_a_loss_that_is_nan_in_some_updates_of_an_iteration_is_noticed_in_its_interval(monkeypatch):
+    """A row's losses are means without nan; the networks say so at once."""
+    hyper = TrainingSession._hyper
+    monkeypatch.setattr(
+        TrainingSession, "_hyper", lambda *args: hyper(*args)._replace(critic_lr=np.full(3, np.nan, np.float32))
+    )
+    training = TrainingSession(config.load([*SMALL, "updates_per_collect=2", "log_every=20", "eval_every=0"]))
+    state, row = training.start()
+    assert training.iterations_per_interval == 1  # the first loss is sound, the second is not
+    said = []
+    watch = DivergenceLogger(training, said.append)
+    watch.log(row)
+    assert not watch.diverged
+    state, row = training.advance(state)
+    assert np.isfinite(row["agent_0_critic_loss"]).all()
+    watch.log(row)
+    assert len(said) == len(watch.diverged) == 3
+    assert {found.step for found in watch.diverged.values()} == {int(row["step"][0])}
 
 
 def test_stop_ends_the_run_with_a_checkpoint(blown, tmp_path, capsys):

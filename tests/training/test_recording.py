@@ -109,6 +109,30 @@ def test_killed_after_its_last_checkpoint(copy, whole, left):
         resume(copy)
 
 
+def test_a_metrics_table_that_is_lost_after_the_last_checkpoint_leaves_a_summary(copy):
+    """Without means, as there is nothing to make them of; commands that play with the policies need none."""
+    for name in ("metrics.csv", "learning_curve.png", "summary.json"):
+        (copy / name).unlink()
+    said = resume(copy)
+    step = checkpoint.steps(copy / "checkpoints")[-1]
+    assert sum("lacks rows between env steps" in line for line in said) == 1
+    assert "has no rows: there are no means" in said[-1]
+    assert RunDirectory(copy).summary() == {"total_steps": step, "diverged": {}, "last_tenth": {}}
+    with pytest.raises(UserError, match="raise total_steps="):
+        resume(copy)
+
+
+def test_the_last_rows_that_are_lost_are_not_taken_from_before(copy):
+    """The last tenth and the last evaluation are those of the run's end."""
+    table = copy / "metrics.csv"
+    table.write_bytes(b"".join(table.read_bytes().splitlines(keepends=True)[:-2]))
+    (copy / "summary.json").unlink()
+    assert any("lacks rows between env steps" in line for line in resume(copy))
+    found = RunDirectory(copy).summary()
+    assert found["total_steps"] == checkpoint.steps(copy / "checkpoints")[-1]
+    assert "last_evaluation" not in found and found["last_tenth"] == {}
+
+
 def test_an_older_checkpoint_sets_the_newer_ones_aside(copy, whole):
     """Killed right after it was resumed from an old checkpoint, a run goes on from there, not from what it left."""
     first, second, *later = checkpoint.steps(copy / "checkpoints")

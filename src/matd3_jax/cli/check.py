@@ -91,6 +91,8 @@ def _way_on(found: Condition) -> str:
         )
     if found.finished and not found.needs_step:
         return f"finished; evaluate with: {command.line('matd3_jax.evaluate', run=path)}"
+    if not found.whole and found.run.sweep is not None:
+        return f"its sweep trains it; resume with: {command.line('matd3_jax.sweep', resume=found.run.sweep)}"
     step = {"checkpoint": found.resumable_from} if found.needs_step else {}
     start = "" if found.whole else " (from the start)"
     return f"go on with: {command.line('matd3_jax.train', resume=path, **step)}{start}"

@@ -26,6 +26,10 @@ FORMAT = 1
 """Of what a run directory holds, in its machine.json; directories without it are of format 0, and are read, too."""
 
 
+PLANS = ("batches", "pieces")
+"""What a sweep's file of its batches, and their folder, are called; in older ones the latter."""
+
+
 class RunDirectory:
     """Where a run leaves its files.
 
@@ -112,6 +116,20 @@ class RunDirectory:
             return 0
         number = found.get("format", 0) if isinstance(found, dict) else 0
         return number if isinstance(number, int) else 0
+
+    @property
+    def sweep(self) -> Path | None:
+        """The directory of the sweep that plans this run, and trains it with others; None: it is no sweep's."""
+        path = self.path.resolve()
+        folder = path.parent.parent
+        for plan in (folder / f"{name}.json" for name in PLANS if path.parent.name == "runs"):
+            try:
+                batches = json.loads(plan.read_text(encoding="utf-8"))
+                if any(path.name in batch for batch in batches):
+                    return folder
+            except (OSError, ValueError, TypeError, RecursionError):
+                continue
+        return None
 
     @property
     def bare(self) -> bool:

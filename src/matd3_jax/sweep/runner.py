@@ -17,7 +17,7 @@ import numpy as np
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError
 from matd3_jax.runs import divergence, lock
-from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.runs.directory import PLANS, RunDirectory
 from matd3_jax.runs.paths import is_name
 from matd3_jax.runtime import devices, files
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
@@ -44,8 +44,7 @@ class Sweep:
     def __init__(self, folder: Path, processes: Processes = SINGLE_PROCESS):
         self.folder, self.processes = folder, processes
         self.runs = folder / "runs"
-        # Older sweeps called their batches pieces.
-        self._name = "pieces" if (folder / "pieces.json").exists() else "batches"
+        self._name = next((name for name in reversed(PLANS) if (folder / f"{name}.json").exists()), PLANS[0])
         self._plan = folder / f"{self._name}.json"
 
     @property

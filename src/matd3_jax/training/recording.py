@@ -1,6 +1,7 @@
 """A run that leaves a directory: started, resumed from whatever a stop or a kill left, finished."""
 
 import contextlib
+import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -97,6 +98,9 @@ class Recorder:
         Raises UserError where there is no run, it has come to its end, or the checkpoint is damaged.
         """
         directory, settings = RunDirectory.open(path)
+        if directory.sweep is not None and directory.summary() is None and not checkpoint.steps(directory.checkpoints):
+            line = shlex.join(["python", "-m", "matd3_jax.sweep", f"resume={directory.sweep}"])
+            raise UserError(f"{path} is trained together with others, by its sweep: resume it with: {line}")
         self.path = path
         if total_steps is not None:
             settings = config.from_dict({**settings.to_dict(), "total_steps": total_steps})
