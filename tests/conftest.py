@@ -64,8 +64,3 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 def fully_optimized():
     """`jax.jit` as it compiles outside of the tests."""
     return functools.partial(jax.jit, compiler_options=FULL)
-
-
-@pytest.fixture(scope="session")
-def quick_jit():
-    """Everything compiles quickly; until the modules that ask for it no longer do."""

@@ -3,7 +3,6 @@
 import math
 from typing import Any, NamedTuple
 
-
 LARGEST = 2**63 - 1
 """Of whole numbers, which count steps and entries of arrays."""
 

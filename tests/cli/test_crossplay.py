@@ -20,8 +20,6 @@ from matd3_jax.runtime import devices
 from matd3_jax.training import checkpoint
 from matd3_jax.training.session import TrainingSession
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):

@@ -33,11 +33,6 @@ TINY = [
 ]  # fmt: skip
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick(quick_jit):
-    """Every program of this module, but for those of processes of their own, compiles with little optimization."""
-
-
 def run(out: Path, *more: str) -> int:
     return train.main([*TINY, f"out={out}", *more])
 

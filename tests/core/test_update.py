@@ -18,8 +18,6 @@ TOLERANCE = 1e-10
 roots of second moments as small as 1e-13 (weights move 0.01 m / sqrt(v)) enlarges that some hundred times. The smallest
 effect meant to be seen, Adam's epsilon in the other place, is above 1e-7 (`test_reference_tells_apart`)."""
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 
 def noise_table(kind, size, batch=BATCH):
     """The noise [batch, size] that stands in for every draw of that kind and size: the same for all agents, so that

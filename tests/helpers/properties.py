@@ -21,7 +21,9 @@ GRAMMAR = "0123456789.,:;=+-_eE[]{}()<>'\"\\$~!#%&*/|@^?\n\r\t \x00abcnul\u00e9\
 
 numbers = st.one_of(st.integers().map(str), st.floats().map(repr), st.integers(0, 100).map(str))
 
-words = st.sampled_from(["null", "true", "false", "nan", "inf", "1e6", "0x10", "1_000", "${seed}", "matd3", "..", "~", ""])
+words = st.sampled_from(
+    ["null", "true", "false", "nan", "inf", "1e6", "0x10", "1_000", "${seed}", "matd3", "..", "~", ""]
+)
 
 texts = st.one_of(
     st.text(GRAMMAR, max_size=12),

@@ -23,7 +23,9 @@ def tables(draw) -> tuple[bytes, list[int]]:
     written = ""
     for step in steps:
         row = {name: np.full(len(seeds), step) for name in HEADER[:4]} | {"seed": seeds}
-        row |= {name: np.float32(draw(st.lists(numbers, min_size=len(seeds), max_size=len(seeds)))) for name in HEADER[4:]}
+        row |= {
+            name: np.float32(draw(st.lists(numbers, min_size=len(seeds), max_size=len(seeds)))) for name in HEADER[4:]
+        }
         written += metrics_table.row_lines(row, header=not written)
     return written.encode(), seeds.tolist()
 
@@ -72,7 +74,12 @@ def test_a_changed_byte_is_noticed_where_it_can_be(table, data):
         assert set(columns["seed"]) <= set(seeds) and len(columns["step"]) >= len(true) - 2 * len(seeds)
 
 
-@given(st.one_of(st.binary(max_size=60), st.lists(st.text("0123456789,.e+-nasteps\r\n\"\0", max_size=9)).map("\n".join)))
+anything = st.one_of(
+    st.binary(max_size=60), st.lists(st.text('0123456789,.e+-nasteps\r\n"\0', max_size=9)).map("\n".join)
+)
+
+
+@given(anything)
 @examples(200)
 def test_any_bytes_are_read_and_what_is_left_is_whole(data):
     data = data if isinstance(data, bytes) else f"step,seed\n{data}\n".encode()

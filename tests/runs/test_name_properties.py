@@ -16,7 +16,9 @@ from matd3_jax.runs.paths import check_directory, inside, is_name
 from matd3_jax.sweep.search_space import Axis, names
 
 SETTINGS = config.load(["env=point_reach"])
-paths = st.one_of(texts, st.lists(st.sampled_from(["..", ".", "a", "b c", "", "~", "\u00e9"]), max_size=5).map("/".join))
+paths = st.one_of(
+    texts, st.lists(st.sampled_from(["..", ".", "a", "b c", "", "~", "\u00e9"]), max_size=5).map("/".join)
+)
 
 
 @contextlib.contextmanager

@@ -24,11 +24,6 @@ TINY = [
 SWEPT = [*TINY, "algo.lr=0.01,0.1"]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick(quick_jit):
-    """Every program of this module compiles with little optimization."""
-
-
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("sweeps")

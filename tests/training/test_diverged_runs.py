@@ -27,8 +27,6 @@ SMALL = [
 ]  # fmt: skip
 LOST, SOUND = 5, (4, 6)
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 
 @pytest.fixture
 def blown(monkeypatch):

@@ -31,11 +31,6 @@ SMALL = [
 ]  # fmt: skip
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick(quick_jit):
-    """Every program of this module compiles with little optimization."""
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """An unbroken run."""

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-
 COUNTS = ("step", "seed", "updates", "episodes")
 """Columns of whole numbers."""
 

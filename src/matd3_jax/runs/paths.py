@@ -9,7 +9,6 @@ from pathlib import Path
 from matd3_jax import lists
 from matd3_jax.errors import UserError
 
-
 LONGEST_NAME = 255
 """Bytes of a file's name, on all usual file systems."""
 
