@@ -1,4 +1,4 @@
-"""What the benchmarks make of their measurements, on made-up numbers; their counts beside counts by hand."""
+"""What the benchmarks make of their measurements, on made-up numbers; their counts compared with counts by hand."""
 
 import json
 
@@ -139,17 +139,17 @@ def test_compile_times_reports_medians_and_slow_programs():
 
 
 def test_a_fresh_process_answers_or_says_what_went_wrong(tmp_path):
-    (tmp_path / "told.py").write_text(
+    (tmp_path / "asked.py").write_text(
         "import os, sys\nprint('on the way')\nif sys.argv[1] == 'well': print('{\"a\": 1}')\n"
         "if sys.argv[1] == 'mistake': sys.exit(print('error: no seeds', file=sys.stderr) or 2)\n"
         "if sys.argv[1] == 'killed': os.kill(os.getpid(), 9)\nif sys.argv[1] == 'bug': 1 / 0\n"
     )
     environment = {"PYTHONPATH": str(tmp_path)}
-    assert fresh.run("told", ["well"], environment) == {"a": 1}
+    assert fresh.run("asked", ["well"], environment) == {"a": 1}
     for word, error, text in (
         ("mistake", UserError, "^no seeds$"),
         ("killed", UserError, "killed by signal 9"),
         ("bug", RuntimeError, "ZeroDivisionError"),
     ):
         with pytest.raises(error, match=text):
-            fresh.run("told", [word], environment)
+            fresh.run("asked", [word], environment)

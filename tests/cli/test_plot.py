@@ -278,7 +278,7 @@ def test_seeds_that_end_early_are_told(drawn, tmp_path, capsys):
     make_run(tmp_path / "a", "seeds=2", steps=range(100, 1100, 100), values=values)
     (axis,) = drawn("runs=a").axes
     np.testing.assert_allclose(lines(axis)["matd3"][1], values[:, :2].mean(axis=0))
-    assert "the values with seed 1 end; others go on to 1,000" in capsys.readouterr().out
+    assert "the values with seed 1 end; others reach 1,000" in capsys.readouterr().out
 
 
 def test_seeds_that_diverged_are_told(drawn, tmp_path, capsys):
@@ -296,7 +296,7 @@ def test_seeds_that_diverged_are_told(drawn, tmp_path, capsys):
     (axis,) = drawn("runs=a").axes
     np.testing.assert_array_equal(lines(axis)["matd3"][0], [100, 200, 300])
     out = capsys.readouterr().out
-    assert "the values with seed 1 end; others go on to 1,000" in out and "seed 1 diverged at 400: values from" in out
+    assert "the values with seed 1 end; others reach 1,000" in out and "seed 1 diverged at 400: values from" in out
 
 
 # ---- tables of several runs ------------------------------------------------------------------------------------------

@@ -106,7 +106,7 @@ def test_settings_of_a_run_from_before_a_key_mean_what_they_meant(tmp_path):
 
 
 def test_keys_have_had_other_names(tmp_path):
-    """Runs from before are read; who writes an old name is told the new one."""
+    """Runs from before are read; who writes an old name is given the new one."""
     settings = config.load(["env=simple_tag", "adversary=maddpg", "normalize_observations=true"])
     old = settings.to_dict()
     old["normalise_observations"] = old.pop("normalize_observations")

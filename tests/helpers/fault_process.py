@@ -1,4 +1,4 @@
-"""A process that runs commands one after the other, as `matd3 COMMAND ...` would, and fails or dies where it is told.
+"""A process that runs commands one after the other, as `matd3 COMMAND ...` would, and fails or dies as planned.
 
 Jobs come as lines of JSON on its standard input: {"argv", "folder" (which is watched), "output", "log", "how", "at",
 "where", "largest"}; the exit code of each goes to its standard output. Imports and compiled programs serve all jobs.

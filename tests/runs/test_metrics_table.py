@@ -79,8 +79,8 @@ def test_gaps_are_named_and_other_intervals_are_none():
     assert gaps([]) == [(0, 800)]
 
 
-def test_a_run_directory_cuts_and_goes_on(tmp_path):
-    """After a cut the table goes on as if nothing had been there; an emptied one begins anew, header first."""
+def test_a_run_directory_cuts_and_appends(tmp_path):
+    """After a cut the table continues as if nothing had been there; an emptied one begins with the header."""
     run = RunDirectory(tmp_path)
     for row in ROWS:
         run.append(row)

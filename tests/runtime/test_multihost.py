@@ -1,4 +1,4 @@
-"""Several processes: who they are, what they tell each other, and that a run of theirs is that of one process."""
+"""Several processes: who they are, what they send each other, and that a run of theirs is that of one process."""
 
 import csv
 import json
@@ -141,7 +141,7 @@ def test_shares_are_neighbors_and_nearly_equal(size):
         Processes(0, size).share(size - 1)
 
 
-# ---- what they tell each other ---------------------------------------------------------------------------------------
+# ---- what they send each other ---------------------------------------------------------------------------------------
 
 
 class Store:

@@ -78,7 +78,7 @@ def test_there_is_a_checkpoint_right_after_the_warm_up(whole):
 def test_killed_before_its_first_checkpoint(copy, whole):
     shutil.rmtree(copy / "checkpoints")
     (copy / "summary.json").unlink()
-    assert "no checkpoint yet: this run starts anew" in resume(copy)
+    assert "no checkpoint yet: this run starts again" in resume(copy)
     same(copy, whole)
 
 
@@ -129,7 +129,7 @@ def test_the_last_rows_that_are_lost_are_not_taken_from_before(copy):
 
 
 def test_an_older_checkpoint_sets_the_newer_ones_aside(copy, whole):
-    """Killed right after it was resumed from an old checkpoint, a run goes on from there, not from what it left."""
+    """Killed right after it was resumed from an old checkpoint, a run continues from there, not from what it left."""
     first, second, *later = checkpoint.steps(copy / "checkpoints")
     (copy / "summary.json").unlink()
 
@@ -304,17 +304,17 @@ def test_a_signal_is_noted_while_something_is_printed(monkeypatch):
     """The handler itself prints nothing: it may run in the middle of a print."""
     from matd3_jax.runtime import signals
 
-    told = threading.Event()
-    monkeypatch.setattr(signals, "note", lambda line: told.set())
+    noted = threading.Event()
+    monkeypatch.setattr(signals, "note", lambda line: noted.set())
     before = {name: signal.getsignal(getattr(signal, name)) for name in signals.NAMES}
     try:
         stop = signals.Stop()
         main = threading.current_thread()
         printed = []
-        monkeypatch.setattr(signals, "note", lambda line: (printed.append(threading.current_thread()), told.set()))
+        monkeypatch.setattr(signals, "note", lambda line: (printed.append(threading.current_thread()), noted.set()))
         signal.raise_signal(signal.SIGHUP)
         assert stop.signal == signal.SIGHUP
-        assert told.wait(10) and printed[0] is not main
+        assert noted.wait(10) and printed[0] is not main
         with pytest.raises(SystemExit) as ended:
             signal.raise_signal(signal.SIGTERM)
         assert ended.value.code == 128 + signal.SIGTERM

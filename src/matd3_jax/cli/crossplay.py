@@ -151,7 +151,7 @@ def _play(entrants: Sequence[Entrant], env: Environment, options: CrossPlay, mat
     return Pairings(np.concatenate(runs), np.concatenate(seeds), np.concatenate(returns), matched)
 
 
-# ---- telling ---------------------------------------------------------------------------------------------------------
+# ---- output ---------------------------------------------------------------------------------------------------------
 
 
 def _print(pairings: Pairings, names: Sequence[str], title: str) -> None:

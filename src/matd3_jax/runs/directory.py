@@ -47,7 +47,7 @@ class RunDirectory:
 
     @staticmethod
     def check_new(path: Path, or_another: bool = False) -> None:
-        """Raise UserError where no directory for a run, or a sweep, can be made anew. Makes nothing.
+        """Raise UserError where no directory for a run, or a sweep, can be made. Makes nothing.
 
         or_another: another one (see `create`) will do where this is there.
         """
@@ -140,7 +140,7 @@ class RunDirectory:
         return {found.name for found in self.path.iterdir()} <= own
 
     def clean(self) -> None:
-        """Take away what killed writes left beside the files, while the lock of the directory is held.
+        """Take away the partial files that killed writes left, while the lock of the directory is held.
 
         Raises UserError where what is written in place is a link: what is behind it is not the run's.
         """
@@ -161,7 +161,7 @@ class RunDirectory:
             files.sync_folder(self.path)
 
     def clear(self) -> None:
-        """Take away all but settings and machine: the run begins anew."""
+        """Take away all but settings and machine: the run starts again."""
         for path in (self.metrics, self.curve, self.path / "summary.json"):
             path.unlink(missing_ok=True)
         shutil.rmtree(self.checkpoints, ignore_errors=True)
@@ -216,7 +216,7 @@ class RunDirectory:
 
 
 def _there(path: Path) -> str:
-    return f"{path} is there already: choose another name=, or go on with {shlex.quote(f'resume={path}')}"
+    return f"{path} is there already: choose another name=, or resume it with {shlex.quote(f'resume={path}')}"
 
 
 def together(paths: Sequence[Path]) -> dict[str, np.ndarray]:

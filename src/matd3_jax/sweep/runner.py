@@ -29,7 +29,8 @@ from matd3_jax.training import run as training_run
 from matd3_jax.training.loggers import DivergenceLogger, Logger, TableLogger, TensorBoardLogger
 from matd3_jax.training.memory import most_seeds, needed
 from matd3_jax.training.progress import ProgressBar
-from matd3_jax.training.session import Row, TrainingSession
+from matd3_jax.training.rows import Row
+from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import TrainState
 
 
@@ -236,7 +237,7 @@ class Batch:
         self._finish(outcome.state, outcome.row, {"seconds": round(time.monotonic() - begun, 1), **rates})
 
     def _begin(self) -> tuple[TrainState, Row, bool]:
-        """The state to go on from, its row, and whether nothing was trained yet."""
+        """The state to train from, its row, and whether nothing was trained yet."""
         first, broadcast = self.processes.first, self.processes.broadcast
         for run in self.runs if first else ():
             run.clean()

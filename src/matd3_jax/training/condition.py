@@ -40,7 +40,7 @@ class Condition:
 
     @property
     def resumable_from(self) -> int | None:
-        """Env step of the last checkpoint that is whole; None: the run starts anew."""
+        """Env step of the last checkpoint that is whole; None: the run starts again."""
         return self.whole[-1] if self.whole else None
 
     @property
@@ -84,7 +84,7 @@ def of_run(path: Path) -> Condition:
     problems += [f"{run.metrics}: {line}" for line in expected.lines(table, done)]
     gaps = tuple(expected.gaps(table, done))
     if (run.path / "summary.json").exists() and run.summary() is None:
-        problems.append(f"{run.path / 'summary.json'} is not whole: a resume makes it anew")
+        problems.append(f"{run.path / 'summary.json'} is not whole: a resume makes it again")
     if not _readable(run.path / "machine.json"):
         problems.append(f"{run.path / 'machine.json'} is missing or not whole: versions and devices are lost")
     for link in (run.metrics, run.checkpoints, run.tensorboard):

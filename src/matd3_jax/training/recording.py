@@ -22,8 +22,9 @@ from matd3_jax.runtime.signals import Stop
 from matd3_jax.training import announcement, checkpoint, finish
 from matd3_jax.training.loggers import DivergenceLogger, Logger, TableLogger, TensorBoardLogger, warn
 from matd3_jax.training.progress import ProgressBar
+from matd3_jax.training.rows import Row
 from matd3_jax.training.run import Outcome, run
-from matd3_jax.training.session import Row, TrainingSession
+from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import TrainState
 
 Say = Callable[[str], None]
@@ -44,8 +45,8 @@ class Recorder:
         processes: which train together; the first alone writes and speaks.
         heed_signals: whether SIGINT, SIGTERM and SIGHUP end a run after a checkpoint (of a program of its own), or
             stay with the program that calls.
-        say: gets the lines about a run; None: nothing is said, nor a progress bar shown, but of a seed that diverges a
-            RuntimeWarning tells.
+        say: gets the lines about a run; None: nothing is said, nor a progress bar shown, but of a seed that diverges is
+            reported by a RuntimeWarning.
         loggers: get the rows of the metrics table, too.
     """
 
@@ -109,7 +110,7 @@ class Recorder:
             stop = self._stop()
             there = bool(checkpoint.steps(directory.checkpoints)) if self.processes.first else None
             if not self.processes.broadcast(there) and step is None:
-                self.say("no checkpoint yet: this run starts anew")
+                self.say("no checkpoint yet: this run starts again")
                 if self.processes.first:
                     directory.clear()
                 return self._from_the_start(training, directory, stop)
