@@ -48,17 +48,21 @@ def test_exponents_and_figure(tmp_path, monkeypatch):
         (band,) = pictures.bands(above)
         np.testing.assert_allclose(band, [x, 900 * seconds, 1200 * seconds])
         wanted = {"process at most": 1000, "the interval's, by XLA": megabytes, "of it the replay": 5}
-        assert memory.keys() == wanted.keys()
-        for name, line in memory.items():
-            np.testing.assert_allclose(line, np.broadcast_arrays(x, wanted[name]))
-        powers = ["quadratic", "cubic"] if below.get_xlabel() == "agents" else ["linear"]
-        assert [[text.get_text() for text in axis.texts] for axis in (above, below)] == [powers] * 2
+        powers = {"quadratic": 2, "cubic": 3} if below.get_xlabel() == "agents" else {"linear": 1}
+        assert memory.keys() == {*wanted, *powers} and time.keys() == {"measured", "as the products", *powers}
+        for name, line in wanted.items():
+            np.testing.assert_allclose(memory[name], np.broadcast_arrays(x, line))
+        for name, order in powers.items():
+            np.testing.assert_allclose(time[name], [x, 1000 * seconds[0] * (x / x[0]) ** order])
+            np.testing.assert_allclose(memory[name], [x, megabytes[0] * (x / x[0]) ** order])
         assert above.get_xscale() == above.get_yscale() == below.get_yscale() == "log"
         # A power may leave the picture, what was measured may not.
         for axis, values in ((above, 1000 * seconds), (below, megabytes)):
             assert axis.get_ylim()[0] < values.min() and values.max() < axis.get_ylim()[1]
     assert [axis.get_ylabel() for axis in columns[0]] == ["ms an iteration, all seeds", "MB"]
     assert {SERIES[0], SERIES[1], SERIES[4]} <= pictures.colors(path)
+    legend = [text.get_text() for text in columns[-1][0].get_legend().get_texts()]
+    assert legend == ["as the products", "measured", "linear", "quadratic", "cubic"]
 
 
 def test_points_of_the_growth_study_are_possible():
