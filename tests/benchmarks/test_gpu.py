@@ -71,7 +71,7 @@ def test_replay_plan():
         seeds.fitting(trainer, 1e8, 10**9)
 
 
-def test_report_goes_on_where_it_was_cut_off(tmp_path):
+def test_report_continues_where_it_was_cut_off(tmp_path):
     def fail():
         raise RuntimeError("out of\n memory")
 

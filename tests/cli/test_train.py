@@ -83,7 +83,7 @@ def test_the_metrics_table_is_tidy(whole):
     assert all(np.isfinite(float(row["agent_0_critic_loss"])) for row in late)
 
 
-def test_evaluations_are_told_of(whole, tmp_path, capsys):
+def test_evaluations_are_reported(whole, tmp_path, capsys):
     """The last evaluation, of the table's last rows, on the progress line, in the lines at the end and in the summary;
     without evaluations no word of them."""
     last = {name: np.array([float(row[name]) for row in rows(whole)[-3:]]) for name in rows(whole)[-1]}
@@ -267,6 +267,15 @@ def test_evaluate_prints_and_leaves_a_table(whole, capsys):
     before = (whole / "evaluation.csv").read_bytes()
     evaluate.main([f"run={whole}", "episodes=20"])
     assert (whole / "evaluation.csv").read_bytes() == before
+
+
+def test_a_table_that_cannot_be_written_is_one_line(whole, tmp_path, capsys):
+    """On a file system that takes nothing; here a folder has the file's name."""
+    copy = shutil.copytree(whole, tmp_path / "copy", ignore=shutil.ignore_patterns("evaluation.csv"))
+    (copy / "evaluation.csv").mkdir()
+    assert command.code(evaluate.main, [f"run={copy}", "episodes=20"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and str(copy / "evaluation.csv") in said and said.count("\n") == 1
 
 
 def test_evaluate_plays_the_online_actors_and_the_averaged_ones(tmp_path):

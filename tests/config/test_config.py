@@ -142,7 +142,7 @@ def test_auto_is_resolved_once_for_the_run(name, tmp_path, monkeypatch):
     assert config.read(tmp_path / "config.yaml").env["physics"] == "c"
 
 
-def test_a_new_run_is_told_the_engines_new_name():
+def test_a_new_run_is_given_the_engines_new_name():
     with pytest.raises(UserError, match=r"^env\.physics='fast': must be one of .* it is called 'mjx_fast' now$"):
         config.load(["env=ant", "env.physics=fast"])
 

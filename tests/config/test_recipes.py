@@ -58,7 +58,7 @@ def test_algorithms_stay_what_they_are_in_the_fast_recipe(algo):
 
 
 @pytest.mark.parametrize("env", ROBOTS)
-def test_every_robot_has_every_recipe_and_the_fast_one_unless_told(env):
+def test_every_robot_has_every_recipe_and_the_fast_one_by_default(env):
     found = {recipe: config.load([f"env={env}", f"recipe={recipe}"]) for recipe in config.known_names("recipe")}
     assert set(found) == {"fast", "paper", "wide"}
     assert config.load([f"env={env}"]) == found["fast"]

@@ -13,7 +13,7 @@ RUNS, SEEDS = ("one", "other", "third"), 2
 
 @pytest.fixture
 def pairings() -> Pairings:
-    """Three runs of two seeds, each with each; the return of agents is 10 i + j, of adversaries its negative; seeds that
+    """Three runs of two seeds, each with each: the agents get 10 i + j, the adversaries its negative; seeds that
     were trained together have a hundred more."""
     runs, seeds = [], []
     for i in range(len(RUNS)):
