@@ -41,8 +41,8 @@ class Options(OfARun):
     replay: tuple[int, ...] = option("transitions that a replay keeps", default=tuple(AXES["replay"]), least=1)
     batch: tuple[int, ...] = option("transitions of a minibatch", default=tuple(AXES["batch"]), least=1)
     few_seeds: int = option("seeds of the other axes", default=2, least=1)
-    repeats: int = option("stretches that are timed", default=5, least=1)
-    seconds: float = option("length of a stretch", default=1.0, unit="seconds", above=0)
+    repeats: int = option("measurements", default=5, least=1)
+    seconds: float = option("length of a measurement", default=1.0, unit="seconds", above=0)
 
 
 COMMAND = Command("python -m benchmarks.growth", Options, __doc__)
@@ -63,9 +63,9 @@ def main(argv: Sequence[str]) -> int:
         "versions": devices.versions(),
         "commit": commit(),
         "settings": list(argv),
-        "beside": {"seeds": options.few_seeds, **BASE},
+        "others": {"seeds": options.few_seeds, **BASE},
     }
-    print(f"commit {report['commit']}; settings of the other axes {report['beside']}")
+    print(f"commit {report['commit']}; settings of the other axes {report['others']}")
     print(f"{'axis':<7} {'value':>9} {'ms/iter':>11} {'env steps/s':>12} {'GFLOP':>8} {'XLA, MB':>9} "
           f"{'of it replay':>12} {'temporaries':>11} {'process':>8} {'compiled in':>11}", flush=True)  # fmt: skip
     axes: dict[str, list[dict[str, Any]]] = {}

@@ -23,7 +23,8 @@ MEMORY = {
     "xla": (BLUE, "the interval's, by XLA"),
     "replay": (ORANGE, "of it the replay"),
 }
-NAMES = {1: "linear", 2: "quadratic", 3: "cubic"}
+GUIDES = {1: ("linear", (0, (5, 1.5))), 2: ("quadratic", (0, (5, 1.5, 1, 1.5))), 3: ("cubic", (0, (1, 1)))}
+"""Names and dashes of powers."""
 
 
 def draw(path: Path, axes: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
@@ -58,7 +59,13 @@ def draw(path: Path, axes: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
         _limits(grid[0], [[p["cycle_seconds"] * 1000] for points in columns.values() for p in points])
         _limits(grid[1], [[p["memory"][key] / 1e6 for key in MEMORY] for points in columns.values() for p in points])
         for row in grid:
-            row[-1].legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False, handlelength=2)
+            known = {
+                label: handle for axis in row for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+            }
+            guides = [name for name, _ in GUIDES.values()]
+            order = sorted(known, key=lambda label: guides.index(label) if label in guides else -1)
+            frame = {"loc": "center left", "bbox_to_anchor": (1, 0.5), "frameon": False, "handlelength": 2.5}
+            row[-1].legend([known[label] for label in order], order, **frame)
         style.save(figure, path, dpi=200)
 
 
@@ -70,11 +77,10 @@ def _line(axis: Axes, x: np.ndarray, y: np.ndarray, color: Color, label: str) ->
 
 
 def _guides(axis: Axes, x: np.ndarray, first: float, orders: Sequence[int]) -> None:
-    """Powers of x from the first point on, grey, with their names at the end."""
+    """Powers of x from the first point on, grey."""
     for order in orders:
-        y = first * (x / x[0]) ** order
-        axis.plot(x, y, color="0.6", linewidth=0.8, linestyle=(0, (5, 1.5)), zorder=1)
-        axis.annotate(NAMES[order], (x[-1], y[-1]), color="0.4", fontsize=7, ha="right", va="bottom")
+        name, dashes = GUIDES[order]
+        axis.plot(x, first * (x / x[0]) ** order, color="0.55", linewidth=0.9, linestyle=dashes, zorder=1, label=name)
 
 
 def _limits(row: np.ndarray, values: Sequence[Sequence[float]]) -> None:

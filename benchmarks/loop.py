@@ -35,8 +35,8 @@ ITERATIONS = 2
 class Options:
     """Options of this benchmark."""
 
-    repeats: int = option("stretches that are timed", default=5, least=1)
-    seconds: float = option("length of a stretch", default=1.0, unit="seconds", above=0)
+    repeats: int = option("measurements", default=5, least=1)
+    seconds: float = option("length of a measurement", default=1.0, unit="seconds", above=0)
     overrides: tuple[str, ...] = others("any other setting of the run, as matd3_jax.train takes it")
 
 

@@ -26,8 +26,8 @@ class Options(OfARun):
     env: str = option("the robot", default="ant", metavar="NAME")
     num_envs: tuple[int, ...] = option("numbers of environments", default=(1, 16, 256, 4096), least=1)
     seeds: int = option("side by side", default=2, least=1)
-    repeats: int = option("stretches that are timed", default=3, least=1)
-    seconds: float = option("length of a stretch", default=2.0, unit="seconds", above=0)
+    repeats: int = option("measurements", default=3, least=1)
+    seconds: float = option("length of a measurement", default=2.0, unit="seconds", above=0)
     loops: bool = option("false: the environment alone", default=True)
 
 

@@ -3,7 +3,7 @@
 Takes settings as `python -m matd3_jax.sweep` does (default: the 18 of its documentation) and times, in turns, a block
 of `steps` env steps of every seed of each program that the sweep consists of, and of one program with as many seeds of
 the setting without the swept values. The cost is the time of all the sweep's programs over that of the one; compilation
-is told apart. Where a swept value changes what is computed (policy_delay=1 updates actors twice as often as the
+is distinguished. Where a swept value changes what is computed (policy_delay=1 updates actors twice as often as the
 default), that is in the cost.
 """
 
@@ -32,8 +32,8 @@ class Options(OfARun):
     """Options of this benchmark."""
 
     seeds: int = option("of each setting", default=4, least=1)
-    repeats: int = option("stretches that are timed", default=5, least=1)
-    steps: int = option("length of a stretch", default=1200, unit="env steps", least=1)
+    repeats: int = option("measurements", default=5, least=1)
+    steps: int = option("length of a measurement", default=1200, unit="env steps", least=1)
 
 
 COMMAND = Command("python -m benchmarks.sweep", Options, __doc__)

@@ -39,8 +39,8 @@ class Options(OfARun):
     """Options of this benchmark."""
 
     seeds: tuple[int, ...] = option("numbers of seeds", default=(1, 4, 20), least=1)
-    repeats: int = option("stretches that are timed", default=5, least=1)
-    seconds: float = option("length of a stretch", default=1.0, unit="seconds", above=0)
+    repeats: int = option("measurements", default=5, least=1)
+    seconds: float = option("length of a measurement", default=1.0, unit="seconds", above=0)
 
 
 COMMAND = Command("python -m benchmarks.throughput", Options, __doc__)

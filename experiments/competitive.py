@@ -124,7 +124,7 @@ STUDY = Study(
     "the four pairings, 60,000 episodes of 25 steps. A final return is the mean of the last 1,000 training episodes (a "
     "fifth of all in runs below 5,000), summed over the team's agents; in Predator-Prey the team are the predators. "
     "The paper does not say how it normalized; here, for each task, the worst single trial of all pairings is 0 and "
-    "the best is 1. The direct comparison is a MATD3 team against a MADDPG opponent beside a MADDPG team against a "
+    "the best is 1. The direct comparison is of a MATD3 team against a MADDPG opponent with a MADDPG team against a "
     "MATD3 opponent; tests are on the returns as they are.",
     settings=settings,
     keys={"env": "env.name", "algo": "algo.name", "adversary": "adversary.name"},

@@ -79,6 +79,15 @@ def point(axis: Axes, row: float, values: np.ndarray, color: str, offset: float 
     axis.plot(values, np.full(len(values), row + offset), ".", color="black", markersize=3, alpha=0.5)
 
 
+def legend_above(axis: Axes, columns: int = 2) -> None:
+    """Draw the legend over the panel, and the title over that: neither lies on what is drawn, nor looks like it."""
+    entries = len(axis.get_legend_handles_labels()[1])
+    if entries:
+        frame = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "frameon": False, "columnspacing": 1.2}
+        axis.legend(ncols=columns, fontsize="small", handlelength=1.8, **frame)
+    axis.set_title(axis.get_title(), pad=8 + 14 * -(-entries // columns))
+
+
 def save(figure: Figure, path: Path) -> None:
     style.save(figure, path, dpi=130)
 

@@ -159,7 +159,7 @@ def _thirds(over: np.ndarray) -> str:
 
 
 def draw(table: Table, path: Path) -> None:
-    figure, axes = figures.canvas(4, columns=2, height=3.3)
+    figure, axes = figures.canvas(4, columns=2, height=3.6)
     levels = []
     for axis, algo in zip(axes, ALGOS, strict=False):
         found = measured(table.where(algo=algo))
@@ -170,7 +170,7 @@ def draw(table: Table, path: Path) -> None:
         steps, estimate, truth = found
         figures.band(axis, steps / 1e6, estimate, figures.COLORS[algo], "critics' estimate")
         figures.band(axis, steps / 1e6, truth, "#555555", "true value", "dashed")
-        axis.legend(frameon=False)
+        figures.legend_above(axis)
         late = np.concatenate([values.mean(axis=0)[1 + len(steps) // 8 :] for values in (estimate, truth)])
         levels += [1.3 * late.min(initial=0.0), late.max(initial=0.0) + 10]  # the first ones lie far below
         figures.band(axes[2], steps / 1e6, estimate - truth, figures.COLORS[algo], figures.NAMES[algo])
@@ -186,18 +186,18 @@ def draw(table: Table, path: Path) -> None:
         if levels:
             axis.set_ylim(min(levels), max(levels))
     axes[2].axhline(0, color="black", linewidth=0.8)
-    axes[2].set_ylabel("overestimation (estimate minus true value)")
+    axes[2].set_ylabel("estimate minus true value")
     late = [line.get_ydata()[1 + len(line.get_ydata()) // 8 :] for line in axes[2].lines[:-1]]
     if late:  # the first evaluations, far above the others, would leave nothing to see of those
         late = np.concatenate(late)
         axes[2].set_ylim(late.min(initial=0.0) - 10, 1.15 * late.max(initial=0.0) + 10)
-    axes[2].legend(frameon=False)
+    figures.legend_above(axes[2])
     for axis in axes[:3]:
         axis.set_xlabel("env steps of each seed (millions)")
     axes[3].axvline(0, color="black", linewidth=0.8)
     axes[3].set_xlabel("mean overestimation of a seed")
     axes[3].set_ylabel("its final return")
-    axes[3].legend(frameon=False)
+    figures.legend_above(axes[3])
     figures.save(figure, path)
 
 
@@ -230,7 +230,7 @@ STUDY = Study(
     help=str(__doc__),
     protocol="The paper: Cooperative Navigation with episodes of 200 steps, 5 runs; at each evaluation 200 rollouts of "
     "100 steps from states and actions stored since the last one; their mean discounted return is the true value, "
-    "beside it the critics' estimate for the same pairs; it says neither how often nor how long: here every 50,000 of "
+    "next to it the critics' estimate for the same pairs; it says neither how often nor how long: here every 50,000 of "
     "1.5 million env steps. Values are means over the agents, the untrained critics' first evaluation is left out. A "
     "final return is the mean of the last 1,000 training episodes (a fifth of all in runs below 5,000).",
     settings=settings,

@@ -43,7 +43,7 @@ jax.config.update("jax_num_cpu_devices", 2)  # counts only before the first comp
 
 @pytest.hookimpl(tryfirst=True)  # before the workers are counted
 def pytest_cmdline_main(config: pytest.Config) -> None:
-    """Share the files out among workers, unless told how many (-n) or given one file only."""
+    """Share the files out among workers, unless -n says how many or one file only is given."""
     if IN_WORKER:
         return  # or each worker would start its own
     files = {argument.split("::")[0] for argument in config.args}
@@ -64,8 +64,3 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 def fully_optimized():
     """`jax.jit` as it compiles outside of the tests."""
     return functools.partial(jax.jit, compiler_options=FULL)
-
-
-@pytest.fixture(scope="session")
-def quick_jit():
-    """Everything compiles quickly; until the modules that ask for it no longer do."""

@@ -61,7 +61,7 @@ def sweep(path: Path, *more: str) -> list[str]:
 
 
 def lines(ended: Ended) -> list[str]:
-    """The errors that a command has told."""
+    """The errors that a command has reported."""
     return [line for line in ended.output.splitlines() if line.startswith("error: ")]
 
 

@@ -1,6 +1,6 @@
 """Stepping alone of environments in JAX, ours and JaxMARL's in the same loop: random actions, one program with
-`jax.vmap` over environments in `jax.lax.scan`, every episode that ends started anew (JaxMARL's `step`, and ours under
-JaxMARL's calling convention, `matd3_jax.interop.jaxmarl`).
+`jax.vmap` over environments in `jax.lax.scan`, every episode that ends followed by another (JaxMARL's `step`, and ours
+under JaxMARL's calling convention, `matd3_jax.interop.jaxmarl`).
 
 Case: {"suite": "ours" or "jaxmarl", "env": name, "options": {...}, "num_envs": n, "steps": of each environment in a
 block}.

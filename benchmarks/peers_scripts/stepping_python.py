@@ -1,5 +1,5 @@
 """Stepping alone of mpe2's simple_spread and gymnasium's Ant, one environment: random actions, drawn beforehand, and
-every episode that ends started anew. Case: {"suite": "mpe2" or "gymnasium", "steps": of a block}."""
+every episode that ends followed by another. Case: {"suite": "mpe2" or "gymnasium", "steps": of a block}."""
 
 import itertools
 

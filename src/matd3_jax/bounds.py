@@ -3,9 +3,12 @@
 import math
 from typing import Any, NamedTuple
 
+LARGEST = 2**63 - 1
+"""Of whole numbers, which count steps and entries of arrays."""
+
 
 class Bounds(NamedTuple):
-    """The values that are allowed; None: no such bound. Numbers must be finite in any case.
+    """The values that are allowed; None: no such bound. Numbers must be finite in any case, whole ones up to `LARGEST`.
 
     Raised messages read `KEY=VALUE: must WORDS`.
     """
@@ -20,6 +23,8 @@ class Bounds(NamedTuple):
         """Whether the value is allowed; it has the right type already."""
         if self.choices is not None:
             return value in self.choices
+        if isinstance(value, int) and abs(value) > LARGEST:  # `isfinite` fails on integers that no float holds
+            return False
         return (
             math.isfinite(value)
             and (self.least is None or value >= self.least)

@@ -1,4 +1,4 @@
-"""`python -m matd3_jax.check`: say what a run directory holds, what is damaged, and how to go on."""
+"""`python -m matd3_jax.check`: say what a run directory holds, what is damaged, and how to resume it."""
 
 from matd3_jax.cli import command
 

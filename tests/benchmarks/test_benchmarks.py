@@ -1,4 +1,4 @@
-"""What the benchmarks make of their measurements, on made-up numbers; their counts beside counts by hand."""
+"""What the benchmarks make of their measurements, on made-up numbers; their counts compared with counts by hand."""
 
 import json
 
@@ -48,17 +48,21 @@ def test_exponents_and_figure(tmp_path, monkeypatch):
         (band,) = pictures.bands(above)
         np.testing.assert_allclose(band, [x, 900 * seconds, 1200 * seconds])
         wanted = {"process at most": 1000, "the interval's, by XLA": megabytes, "of it the replay": 5}
-        assert memory.keys() == wanted.keys()
-        for name, line in memory.items():
-            np.testing.assert_allclose(line, np.broadcast_arrays(x, wanted[name]))
-        powers = ["quadratic", "cubic"] if below.get_xlabel() == "agents" else ["linear"]
-        assert [[text.get_text() for text in axis.texts] for axis in (above, below)] == [powers] * 2
+        powers = {"quadratic": 2, "cubic": 3} if below.get_xlabel() == "agents" else {"linear": 1}
+        assert memory.keys() == {*wanted, *powers} and time.keys() == {"measured", "as the products", *powers}
+        for name, line in wanted.items():
+            np.testing.assert_allclose(memory[name], np.broadcast_arrays(x, line))
+        for name, order in powers.items():
+            np.testing.assert_allclose(time[name], [x, 1000 * seconds[0] * (x / x[0]) ** order])
+            np.testing.assert_allclose(memory[name], [x, megabytes[0] * (x / x[0]) ** order])
         assert above.get_xscale() == above.get_yscale() == below.get_yscale() == "log"
         # A power may leave the picture, what was measured may not.
         for axis, values in ((above, 1000 * seconds), (below, megabytes)):
             assert axis.get_ylim()[0] < values.min() and values.max() < axis.get_ylim()[1]
     assert [axis.get_ylabel() for axis in columns[0]] == ["ms an iteration, all seeds", "MB"]
     assert {SERIES[0], SERIES[1], SERIES[4]} <= pictures.colors(path)
+    legend = [text.get_text() for text in columns[-1][0].get_legend().get_texts()]
+    assert legend == ["as the products", "measured", "linear", "quadratic", "cubic"]
 
 
 def test_points_of_the_growth_study_are_possible():
@@ -139,20 +143,20 @@ def test_compile_times_reports_medians_and_slow_programs():
 
 
 def test_a_fresh_process_answers_or_says_what_went_wrong(tmp_path):
-    (tmp_path / "told.py").write_text(
+    (tmp_path / "asked.py").write_text(
         "import os, sys\nprint('on the way')\nif sys.argv[1] == 'well': print('{\"a\": 1}')\n"
         "if sys.argv[1] == 'mistake': sys.exit(print('error: no seeds', file=sys.stderr) or 2)\n"
         "if sys.argv[1] == 'killed': os.kill(os.getpid(), 9)\nif sys.argv[1] == 'bug': 1 / 0\n"
     )
     environment = {"PYTHONPATH": str(tmp_path)}
-    assert fresh.run("told", ["well"], environment) == {"a": 1}
+    assert fresh.run("asked", ["well"], environment) == {"a": 1}
     for word, error, text in (
         ("mistake", UserError, "^no seeds$"),
         ("killed", UserError, "killed by signal 9"),
         ("bug", RuntimeError, "ZeroDivisionError"),
     ):
         with pytest.raises(error, match=text):
-            fresh.run("told", [word], environment)
+                        fresh.run("asked", [word], environment)
 
 
 def test_recording_counts_the_replays_that_it_writes(tmp_path):

@@ -60,8 +60,8 @@ def test_covered():
 def test_replay_plan():
     """The replay takes what is left, in whole rollouts: one rollout more would not fit."""
     trainer = TrainingSession(config.load(seeds.settings(64, 100_000))).trainer
-    beside = seeds.fitting(trainer, 1e15, 10**9)
-    assert beside == 10**9, "at most what was asked for"
+    found = seeds.fitting(trainer, 1e15, 10**9)
+    assert found == 10**9, "at most what was asked for"
     row, budget = 4 * 127 * trainer.sharding.padded_seeds, 10e9
     capacity = seeds.fitting(trainer, budget, 10**9)
     together = trainer.mesh.size if trainer.on_cpu else trainer.sharding.padded_seeds
@@ -71,7 +71,7 @@ def test_replay_plan():
         seeds.fitting(trainer, 1e8, 10**9)
 
 
-def test_report_goes_on_where_it_was_cut_off(tmp_path):
+def test_report_continues_where_it_was_cut_off(tmp_path):
     def fail():
         raise RuntimeError("out of\n memory")
 
@@ -120,7 +120,7 @@ def test_targets(tmp_path):
     assert "(20 environments): 1.0 min\n" in text
 
 
-def test_returns_beside_the_recorded_ones():
+def test_returns_compared_with_the_recorded_ones():
     """Half of the recorded seeds learn as the others do; 30 more return, which is what a defect would cost, shows."""
     table = wall_clock.recorded()
     odd, even = (table.take(table["seed"] % 2 == k) for k in (1, 0))

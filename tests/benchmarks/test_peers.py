@@ -48,7 +48,7 @@ def workers(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_rates_are_measured_and_failures_are_told(workers):
+def test_rates_are_measured_and_failures_are_reported(workers):
     group = [Row("a", (SLOW, QUICK), (PAIR,)), Row("b", (SLOW,), (DIES,)), Row("c", (SLOW,), (BROKEN,))]
     outcomes, versions = peers.measure(group[:1] + group[2:], 3, 0.05, workers)
     assert versions["ours"]["numpy"] and versions["AgileRL"]["no-such-package"] is None

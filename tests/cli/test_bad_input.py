@@ -60,7 +60,7 @@ def refused(main, argv: list[str], key: str, capsys) -> str | None:
     return f"{shown!r}: leaves {left[0]}" if left else None
 
 
-def tell(capsys, what: str, count: int) -> None:
+def report(capsys, what: str, count: int) -> None:
     with capsys.disabled():
         print(f"{what}: {count} inputs refused")
 
@@ -103,7 +103,7 @@ def test_options_of_commands(name, capsys):
         for key, text in found
     ]
     assert not [line for line in wrong if line]
-    tell(capsys, name, len(found))
+    report(capsys, name, len(found))
 
 
 def test_options_of_benchmarks_and_experiments(capsys):
@@ -118,7 +118,7 @@ def test_options_of_benchmarks_and_experiments(capsys):
             )
     assert len(commands) >= 10 and count > 500
     assert not [line for line in wrong if line]
-    tell(capsys, f"{len(commands)} commands of benchmarks and experiments", count)
+    report(capsys, f"{len(commands)} commands of benchmarks and experiments", count)
 
 
 def of_schema(cls: type, prefix: str) -> Iterator[tuple[str, str]]:
@@ -147,7 +147,7 @@ def test_settings(prefix, capsys):
         refused(lambda argv: command.start("train", argv), [*more, f"{key}={text}"], key, capsys) for key, text in found
     ]
     assert not [line for line in wrong if line]
-    tell(capsys, f"{prefix}SETTING", len(found))
+    report(capsys, f"{prefix}SETTING", len(found))
 
 
 @pytest.mark.parametrize(

@@ -20,11 +20,6 @@ SMALL = [
 ]  # fmt: skip
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick(quick_jit):
-    """Every program of this module compiles with little optimization."""
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     path = tmp_path_factory.mktemp("runs") / "a run"
@@ -51,8 +46,8 @@ def checked(path, capsys, key="run"):
 
 def way_on(said):
     """The arguments of the command that a check names."""
-    (line,) = [line for line in said.splitlines() if "go on with: " in line]
-    words = shlex.split(line.split("go on with: ")[1].removesuffix(" (from the start)"))
+    (line,) = [line for line in said.splitlines() if "resume with: " in line]
+    words = shlex.split(line.split("resume with: ")[1].removesuffix(" (from the start)"))
     assert words[:3] == ["python", "-m", "matd3_jax.train"]
     return words[3:]
 
@@ -97,7 +92,7 @@ def lose_all_rows(run):
 def tear_a_row(run):
     with (run / "metrics.csv").open("ab") as file:
         file.write(b"700,0,1")
-    return ["1 damaged line, left out by a resume"]
+    return ["1 damaged line, left out"]
 
 
 def half_a_summary(run):
@@ -124,11 +119,11 @@ def test_damages_are_named_and_the_way_on_is_one(run, damage, capsys):
         assert RunDirectory(run).summary() is not None
         capsys.readouterr()
         code, said = checked(run, capsys)
-        assert code == int(damage in (lose_rows, lose_all_rows, no_machine))  # what cannot be made anew
+        assert code == int(damage in (lose_rows, lose_all_rows, no_machine))  # what cannot be made again
 
 
 def test_what_is_no_damage(run, capsys):
-    """A run that was killed: no summary, files half written beside the others, a checkpoint half written or set aside,
+    """A run that was killed: no summary, files half written, a checkpoint half written or set aside,
     and before its first checkpoint."""
     unfinished(run)
     (run / ".config.7.partial.yaml").write_text("")
@@ -170,11 +165,11 @@ def test_a_sweep(tmp_path, capsys):
     capsys.readouterr()
     code, said = checked(folder, capsys, "sweep")
     assert code == 0 and "batch 0: 2 runs, not begun" in said
-    assert f"go on with: {command.line('matd3_jax.sweep', resume=folder)}" in said
+    assert f"resume with: {command.line('matd3_jax.sweep', resume=folder)}" in said
     assert sweep.main([f"resume={folder}"]) == 0
     capsys.readouterr()
     code, said = checked(folder, capsys, "sweep")
-    assert code == 0 and "batch 0: 2 runs, finished" in said and "finished; make its table anew with" in said
+    assert code == 0 and "batch 0: 2 runs, finished" in said and "finished; make its table again with" in said
     tear_a_row(folder / "runs" / "lr_0.01")
     code, said = checked(folder, capsys, "sweep")
     assert code == 1 and "damaged: lr_0.01: " in said and "1 damaged line" in said

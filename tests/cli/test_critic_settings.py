@@ -5,7 +5,6 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-import pytest
 from checkpoint_arrays import leaves
 
 from matd3_jax import config
@@ -19,11 +18,6 @@ TINY = [
     "eval_episodes=2",
 ]  # fmt: skip
 DISTRIBUTION = ["algo.critic_range=[-60,5]", "algo.critic_atoms=9", "adversary.critic_norm=layer"]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quick(quick_jit):
-    """Every program of this module compiles with little optimization."""
 
 
 def test_resumed_to_the_bit(tmp_path):

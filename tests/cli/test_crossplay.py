@@ -7,6 +7,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import pictures
 import pytest
 from cross_cases import SEED, SMALL, meet, runs
 
@@ -20,8 +21,6 @@ from matd3_jax.runs.paths import paths
 from matd3_jax.runtime import devices
 from matd3_jax.training import checkpoint
 from matd3_jax.training.session import TrainingSession
-
-pytestmark = pytest.mark.usefixtures("quick_jit")
 
 
 @pytest.fixture(scope="module")
@@ -48,12 +47,12 @@ def table(path):
 def test_command(saved, tmp_path, monkeypatch, capsys):
     """Three runs, seeds x seeds: every pair in the table with its numbers; the means are those of the pairs."""
     monkeypatch.chdir(tmp_path)
+    drawn = pictures.written(monkeypatch)
     where = f"runs={saved}/mixed,{saved}/[jn]o*"
     assert crossplay.main([where, "episodes=4", f"seed={SEED}", "deterministic=true"]) == 0
     (out,) = (tmp_path / "crossplay").iterdir()
     assert out.name.startswith("simple_adversary-")
     assert {p.name for p in out.iterdir()} == {"pairs.csv", "means.csv", "heat_map.png", "crossplay.json"}
-    assert (out / "heat_map.png").read_bytes()[:4] == b"\x89PNG"
     found = json.loads((out / "crossplay.json").read_text())
     assert found["env"]["name"] == "simple_adversary" and found["pairing"] == "all" and found["seed"] == SEED
     assert found["runs"]["joint"]["algorithms"] == {"agents": "td3", "adversaries": "iddpg"}
@@ -80,6 +79,9 @@ def test_command(saved, tmp_path, monkeypatch, capsys):
     half = 4.303 * np.std(own, axis=0, ddof=1)[0] / np.sqrt(3)  # Student's t of 2 degrees of freedom, from a table
     assert float(means["mixed", "mixed", "own"]["return_agents_half_width"]) == pytest.approx(half, rel=1e-3)
     assert means["normal", "normal", "cross"]["return_agents_half_width"] == "nan"
+    for axis, team in zip(drawn[Path("crossplay") / out.name / "heat_map.png"].axes, TEAMS, strict=False):
+        cells = [[float(means[a, b, "cross"][f"return_{team}"]) for b in first] for a in first]
+        np.testing.assert_allclose(axis.images[0].get_array(), cells)
 
     printed = capsys.readouterr().out
     for words in (

@@ -133,7 +133,7 @@ def test_several_columns_and_axes(drawn, tmp_path):
     np.testing.assert_array_equal(lines(axis)["matd3"][0], [0, 100, 200, 300])
 
 
-def test_many_curves_can_be_told_apart(drawn, tmp_path):
+def test_many_curves_can_be_distinguished(drawn, tmp_path):
     for k in range(12):
         algo = dataclasses.replace(load("seeds=2").algo, tau=(k + 1) / 100)
         make_run(tmp_path / "sweep" / f"run{k:02}", "seeds=2", change={"algo": algo})
@@ -272,16 +272,16 @@ def test_missing_values():
         curves.of_table(table((steps[:2], [1] * 2, [1.0, 2]), (steps[2:], [1] * 3, [1.0, 2, 3])), "return_agents")
 
 
-def test_seeds_that_end_early_are_told(drawn, tmp_path, capsys):
+def test_seeds_that_end_early_are_reported(drawn, tmp_path, capsys):
     values = np.arange(20.0).reshape(2, 10)
     values[1, 2:] = np.nan
     make_run(tmp_path / "a", "seeds=2", steps=range(100, 1100, 100), values=values)
     (axis,) = drawn("runs=a").axes
     np.testing.assert_allclose(lines(axis)["matd3"][1], values[:, :2].mean(axis=0))
-    assert "the values with seed 1 end; others go on to 1,000" in capsys.readouterr().out
+    assert "the values with seed 1 end; others reach 1,000" in capsys.readouterr().out
 
 
-def test_seeds_that_diverged_are_told(drawn, tmp_path, capsys):
+def test_seeds_that_diverged_are_reported(drawn, tmp_path, capsys):
     """Even where what they play has a finite return."""
     make_run(tmp_path / "a", "seeds=2", steps=range(100, 1100, 100), values=np.arange(20.0).reshape(2, 10))
     metrics = tmp_path / "a" / "metrics.csv"
@@ -296,7 +296,7 @@ def test_seeds_that_diverged_are_told(drawn, tmp_path, capsys):
     (axis,) = drawn("runs=a").axes
     np.testing.assert_array_equal(lines(axis)["matd3"][0], [100, 200, 300])
     out = capsys.readouterr().out
-    assert "the values with seed 1 end; others go on to 1,000" in out and "seed 1 diverged at 400: values from" in out
+    assert "the values with seed 1 end; others reach 1,000" in out and "seed 1 diverged at 400: values from" in out
 
 
 # ---- tables of several runs ------------------------------------------------------------------------------------------

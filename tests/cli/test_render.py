@@ -30,7 +30,7 @@ TINY = [
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory, quick_jit) -> Path:
+def run(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("runs")
     assert train.main([*TINY, f"out={out}", "name=push"]) == 0
     return out / "push"
@@ -172,7 +172,7 @@ class Countdown(Environment):
 
 
 @pytest.fixture(scope="module")
-def own(quick_jit):
+def own():
     import matd3_jax
 
     return matd3_jax.train(

@@ -33,11 +33,6 @@ TINY = [
 ]  # fmt: skip
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick(quick_jit):
-    """Every program of this module, but for those of processes of their own, compiles with little optimization."""
-
-
 def run(out: Path, *more: str) -> int:
     return train.main([*TINY, f"out={out}", *more])
 
@@ -88,7 +83,7 @@ def test_the_metrics_table_is_tidy(whole):
     assert all(np.isfinite(float(row["agent_0_critic_loss"])) for row in late)
 
 
-def test_evaluations_are_told_of(whole, tmp_path, capsys):
+def test_evaluations_are_reported(whole, tmp_path, capsys):
     """The last evaluation, of the table's last rows, on the progress line, in the lines at the end and in the summary;
     without evaluations no word of them."""
     last = {name: np.array([float(row[name]) for row in rows(whole)[-3:]]) for name in rows(whole)[-1]}
@@ -153,7 +148,7 @@ def test_stopped_and_resumed_is_the_same_to_the_bit(whole, tmp_path, monkeypatch
         in capsys.readouterr().out
     )
     assert checkpoint.steps(cut / "checkpoints")[-1] == 750
-    # A row that was written after the checkpoint, as by a run that died, is written anew and not twice.
+    # A row that was written after the checkpoint, as by a run that died, is written again and not twice.
     with (cut / "metrics.csv").open("a") as file:
         file.write(",".join(["950"] + ["0"] * (len(rows(cut)[0]) - 1)) + "\n")
     assert train.main([f"resume={cut}"]) == 0
@@ -274,7 +269,16 @@ def test_evaluate_prints_and_leaves_a_table(whole, capsys):
     assert (whole / "evaluation.csv").read_bytes() == before
 
 
-def test_evaluate_plays_the_online_actors_beside_the_averaged_ones(tmp_path):
+def test_a_table_that_cannot_be_written_is_one_line(whole, tmp_path, capsys):
+    """On a file system that takes nothing; here a folder has the file's name."""
+    copy = shutil.copytree(whole, tmp_path / "copy", ignore=shutil.ignore_patterns("evaluation.csv"))
+    (copy / "evaluation.csv").mkdir()
+    assert command.code(evaluate.main, [f"run={copy}", "episodes=20"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and str(copy / "evaluation.csv") in said and said.count("\n") == 1
+
+
+def test_evaluate_plays_the_online_actors_and_the_averaged_ones(tmp_path):
     """Averaging changes no training: the online actors are those of the same run without it."""
     small = ["env=point_reach", "seeds=2", "algo.hidden=[8]", "batch_size=16", "learning_starts=100"]
     found = {}
@@ -338,7 +342,7 @@ def test_a_run_that_cannot_be_trained_leaves_no_directory(case, tmp_path, monkey
 
 
 def test_runs_may_be_called_anything_and_printed_lines_can_be_pasted(tmp_path, capsys):
-    """Train, evaluate by the printed line, and go on by the line of an error message."""
+    """Train, evaluate by the printed line, and resume by the line of an error message."""
     name = "it's [1e3, a=b] ü"
     assert run(tmp_path, f"name={name}") == 0
     assert (tmp_path / name / "summary.json").exists()
@@ -348,7 +352,7 @@ def test_runs_may_be_called_anything_and_printed_lines_can_be_pasted(tmp_path, c
     assert evaluate.main([*words[3:], "episodes=2"]) == 0
     with pytest.raises(UserError) as error:
         run(tmp_path, f"name={name}")
-    argument = shlex.split(str(error.value).split("go on with ")[1])
+    argument = shlex.split(str(error.value).split("resume it with ")[1])
     assert argument == [f"resume={tmp_path / name}"]
     with pytest.raises(UserError, match="raise total_steps="):
         train.main(argument)

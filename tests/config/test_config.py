@@ -106,7 +106,7 @@ def test_settings_of_a_run_from_before_a_key_mean_what_they_meant(tmp_path):
 
 
 def test_keys_have_had_other_names(tmp_path):
-    """Runs from before are read; who writes an old name is told the new one."""
+    """Runs from before are read; who writes an old name is given the new one."""
     settings = config.load(["env=simple_tag", "adversary=maddpg", "normalize_observations=true"])
     old = settings.to_dict()
     old["normalise_observations"] = old.pop("normalize_observations")
@@ -142,7 +142,7 @@ def test_auto_is_resolved_once_for_the_run(name, tmp_path, monkeypatch):
     assert config.read(tmp_path / "config.yaml").env["physics"] == "c"
 
 
-def test_a_new_run_is_told_the_engines_new_name():
+def test_a_new_run_is_given_the_engines_new_name():
     with pytest.raises(UserError, match=r"^env\.physics='fast': must be one of .* it is called 'mjx_fast' now$"):
         config.load(["env=ant", "env.physics=fast"])
 

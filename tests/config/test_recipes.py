@@ -45,7 +45,7 @@ def test_the_papers_recipe_is_the_papers(env, algo):
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_algorithms_stay_what_they_are_in_the_fast_recipe(algo):
-    """One recipe for all: critics, delay and smoothing tell the algorithms apart, and nothing else does."""
+    """One recipe for all: critics, delay and smoothing distinguish the algorithms, and nothing else does."""
     mine, base = (config.load(["env=ant", f"algo={name}"]) for name in (algo, "matd3"))
     assert mine.recipe == "fast"
     a = mine.algo
@@ -58,7 +58,7 @@ def test_algorithms_stay_what_they_are_in_the_fast_recipe(algo):
 
 
 @pytest.mark.parametrize("env", ROBOTS)
-def test_every_robot_has_every_recipe_and_the_fast_one_unless_told(env):
+def test_every_robot_has_every_recipe_and_the_fast_one_by_default(env):
     found = {recipe: config.load([f"env={env}", f"recipe={recipe}"]) for recipe in config.known_names("recipe")}
     assert set(found) == {"fast", "paper", "wide"}
     assert config.load([f"env={env}"]) == found["fast"]

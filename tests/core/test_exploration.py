@@ -115,7 +115,7 @@ def test_outside_of_collecting_the_noise_is_in_the_middle_of_the_range():
 
 
 def test_mixed_teams_keep_their_own_noise():
-    """A team with one number beside a team with a range: its actions are those it has beside anybody."""
+    """A team with one number next to a team with a range: its actions are those it has next to any."""
     algorithms = {"agents": Algorithm(hidden=(4,), noise_range=True), "adversaries": Algorithm(hidden=(4,))}
     env = make("simple_tag", actions="continuous")
     layout = JointLayout.of(env, algorithms)

@@ -210,7 +210,7 @@ def run(slots=SLOTS):
 @pytest.mark.parametrize(("state", "rollouts"), [(0, (0, 2)), (1, (0, 4)), (2, (4, 6)), (3, (4, 8))])
 def test_the_reservoir_is_uniform_since_the_last_evaluation(state, rollouts):
     """Each pair is one transition of the replay, state and all; each transition since the last evaluation, and no
-    other, is as likely; pairs are drawn one by one, and for each seed anew."""
+    other, is as likely; pairs are drawn one by one, and for each seed by itself."""
     states = run()[1]
     reservoir = states[state].reservoir
     counts = []

@@ -16,9 +16,7 @@ from matd3_jax.core.policies import CategoricalPolicy, DeterministicPolicy
 TOLERANCE = 1e-10
 """Absolute and relative, both sides in float64: sums of some hundred terms round at about 1e-14, Adam's division by
 roots of second moments as small as 1e-13 (weights move 0.01 m / sqrt(v)) enlarges that some hundred times. The smallest
-effect meant to be seen, Adam's epsilon in the other place, is above 1e-7 (`test_reference_tells_apart`)."""
-
-pytestmark = pytest.mark.usefixtures("quick_jit")
+effect meant to be seen, Adam's epsilon in the other place, is above 1e-7 (`test_reference_distinguishes`)."""
 
 
 def noise_table(kind, size, batch=BATCH):
@@ -166,7 +164,7 @@ def test_some_norms_are_clipped_and_some_are_not():
         ("categorical", "algorithm.critic_range", (-2.0, 1.6)),
     ],
 )
-def test_reference_tells_apart(name, field, value):
+def test_reference_distinguishes(name, field, value):
     """What the cases vary is seen by the comparison: with one setting changed the reference is elsewhere, by far more
     than the tolerance."""
     p, state, rows, _, _ = base(name)

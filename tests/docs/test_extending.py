@@ -77,7 +77,7 @@ def plain(tmp_path_factory):
     return train(package(tmp_path_factory.mktemp("plain"), []))[0]
 
 
-def test_environment_and_logger_train_as_written(tmp_path, monkeypatch, capsys, quick_jit):
+def test_environment_and_logger_train_as_written(tmp_path, monkeypatch, capsys):
     """In the order of the document: the blocks share their names, as they do for who pastes them."""
     monkeypatch.chdir(tmp_path)
     names = {"__name__": "extending"}

@@ -38,7 +38,7 @@ LEGS = [["hip_4", "ankle_4", "hip_2"], ["ankle_1", "hip_3", "ankle_3", "hip_1", 
 
 
 def brax_env(robot, backend):
-    """brax's own environment, made anew."""
+    """brax's own environment, made again."""
     import brax.envs
 
     with quiet(), quiet_mujoco():

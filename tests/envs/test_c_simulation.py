@@ -1,4 +1,4 @@
-"""Robots in C MuJoCo: the numbers of a plain simulator, to the bit, whatever runs before, beside or around them."""
+"""Robots in C MuJoCo: the numbers of a plain simulator, to the bit, whatever runs before, next to or around them."""
 
 import dataclasses
 import functools
@@ -141,7 +141,7 @@ def test_placing_computes_what_hangs_on_the_state_alone():
     np.testing.assert_array_equal(found.qpos, qpos)
 
 
-# ---- the same whatever runs before, beside or around ---------------------------------------------------------------
+# ---- the same whatever runs before, next to or around ---------------------------------------------------------------
 
 
 @pytest.mark.parametrize("file", FILES)

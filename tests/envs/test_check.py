@@ -56,6 +56,9 @@ BROKEN = {
     # What is declared.
     "no agents": (altered(agents=()), "agents is ()"),
     "names twice": (altered(agents=("a", "a")), "names must differ"),
+    "a name with a comma": (altered(agents=("a", "b,c")), "agents has 'b,c'; names must do without commas"),
+    "a name with a line end": (altered(agents=("a", "b\n")), "agents has 'b\\n'; names must do without commas"),
+    "a measure with a quotation mark": (altered(measures=('"x',)), "measures has '\"x'; names must do without"),
     "teams": (altered(teams=("agents",)), "teams has 1 entries; must be a tuple with one for each of the 2 agents"),
     "team": (altered(teams=("agents", "goalkeepers")), "the team of 'right' is 'goalkeepers'"),
     "sizes": (altered(observation_sizes=[2, 2]), "observation_sizes has a list"),

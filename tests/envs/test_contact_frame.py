@@ -52,7 +52,7 @@ def found():
 
 
 def matching(in_c, of_mjx, k):
-    """Frames of C's contacts at tilt k beside MJX's: those whose distance says they touch, in order of distance."""
+    """Frames of C's contacts at tilt k compared with MJX's: those that touch, in order of distance."""
     distance, frame, position = (np.asarray(part[k]) for part in of_mjx)
     order = [int(np.argmin(np.linalg.norm(position - pos, axis=1))) for _, _, pos in in_c[k]]
     np.testing.assert_allclose(distance[order], [dist for dist, _, _ in in_c[k]], atol=1e-6)

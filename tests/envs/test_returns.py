@@ -1,4 +1,4 @@
-"""Returns of random policies over many episodes, beside those measured with the original programs."""
+"""Returns of random policies over many episodes, compared with those measured with the original programs."""
 
 import functools
 

@@ -1,4 +1,4 @@
-"""Every robot, in C MuJoCo and in MJX, beside gymnasium's version 5 of it: one step from each visited state."""
+"""Every robot, in C MuJoCo and in MJX, compared with gymnasium's version 5 of it: one step from each visited state."""
 
 import functools
 

@@ -44,7 +44,7 @@ def words(claims):
 
 @pytest.mark.parametrize("module", [squashing, robots, recipe, ablation, critics])
 def test_tables_survive_their_file_and_every_setting_is_drawn(module, tmp_path):
-    """Numbers beside texts in a column (a noise, a range of noise) stay different settings after reading, too."""
+    """Numbers and texts in a column (a noise, a range of noise) stay different settings after reading, too."""
     labels = list(module.settings("paper", StudyOptions()))
     table = table_of(module, {label: 1000.0 + 100 * k for k, label in enumerate(labels)})
     tidy.write(table, tmp_path / "curves.csv")

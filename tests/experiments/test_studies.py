@@ -1,4 +1,4 @@
-"""The experiments on made-up data: what the paper found, its opposite, and too little to tell."""
+"""The experiments on made-up data: what the paper found, its opposite, and too little to say."""
 
 import numpy as np
 import pytest

@@ -242,8 +242,8 @@ def test_recorded_commands_can_be_pasted(tmp_path):
     for label, line in cooperative.settings("paper", StudyOptions()).items():
         fake_run(runs / label, [t for t in line if "seeds" not in t], {"return_agents": (NOISE, 10 + NOISE)})
     assert cooperative.main(["train=false", "only=*maddpg* of 'mine'", f"runs={runs}", f"out={out}"]) == 0
-    (told,) = {fact["command"] for fact in json.loads((out / "runs.json").read_text()).values()}
-    assert shlex.split(told) == ["python", "-m", "experiments.cooperative", "only=*maddpg* of 'mine'"]
+    (typed,) = {fact["command"] for fact in json.loads((out / "runs.json").read_text()).values()}
+    assert shlex.split(typed) == ["python", "-m", "experiments.cooperative", "only=*maddpg* of 'mine'"]
 
 
 @pytest.mark.parametrize("module", [ant, cooperative, grid_search])

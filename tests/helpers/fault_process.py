@@ -1,4 +1,4 @@
-"""A process that runs commands one after the other, as `matd3 COMMAND ...` would, and fails or dies where it is told.
+"""A process that runs commands one after the other, as `matd3 COMMAND ...` would, and fails or dies as planned.
 
 Jobs come through a pipe: {"argv", "folder" (which is watched), "output", "log", "how", "at", "where", "largest"}; the
 exit code of each goes back. Compiled programs serve all jobs; what is imported here is there before the fork.

@@ -1,4 +1,4 @@
-"""A small environment whose transitions can be told apart and checked by hand."""
+"""A small environment whose transitions can be distinguished and checked by hand."""
 
 import dataclasses
 from typing import NamedTuple

@@ -250,7 +250,7 @@ def long_step(rows, agents, gamma):
     """n-step returns of consecutive rows [batch, n, row]: plain rows [batch, row - 1], of one step, with the discounted
     sum of rewards, x' of the last row that counts, and discount gamma^(m - 1) (1 - terminated)."""
     size = sum(agent.observation_size for agent in agents)
-    # x, actions, rewards, whether the episode goes on, x', discount
+    # x, actions, rewards, whether the episode continues, x', discount
     goes_on = rows.shape[2] - size - 2
     reward, ending = slice(goes_on - len(agents), goes_on), slice(goes_on + 1, None)
     long = rows[:, 0].copy()
@@ -314,7 +314,7 @@ def update(agents, batches, gumbel, normal, move, sequential):
         if not move[i]:
             continue
 
-        # Actor: climbs the first critic (as it now is) with its own action drawn anew and the others' as replayed.
+        # Actor: climbs the first critic (as it now is) with its own action drawn again and the others' as replayed.
         output, kept = forward(agent.actor, x[i])
         own, kept_act = act(agent.space, output, gumbel(agent.space.size), algorithm.actor_output)
         mixed = [own if j == i else a[j] for j in range(len(agents))]

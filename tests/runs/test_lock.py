@@ -31,7 +31,7 @@ def kind(request, monkeypatch):
     return request.param
 
 
-def test_a_second_process_is_told_who_works_there_and_a_killed_one_is_taken_over(tmp_path, kind):
+def test_a_second_process_learns_who_works_there_and_a_killed_one_is_taken_over(tmp_path, kind):
     other = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path), kind], stdout=subprocess.PIPE, text=True)
     try:
         assert other.stdout.readline() == "held\n"

@@ -5,6 +5,7 @@ import pytest
 
 from matd3_jax.runs import metrics_table
 from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.runs.missing import Expected
 
 ROWS = [
     {"step": np.array([s, s]), "seed": np.array([0, 1]), "q": np.array([s / 3, -1e-7 * s])} for s in (650, 6500, 7000)
@@ -78,19 +79,22 @@ def test_gaps_are_named_and_other_intervals_are_none():
     assert gaps([]) == [(0, 800)]
 
 
-def test_a_run_directory_cuts_and_goes_on(tmp_path):
-    """After a cut the table goes on as if nothing had been there; an emptied one begins anew, header first."""
+def test_a_run_directory_cuts_and_appends(tmp_path):
+    """After a cut the table continues as if nothing had been there; an emptied one begins with the header."""
     run = RunDirectory(tmp_path)
     for row in ROWS:
         run.append(row)
     assert run.metrics.read_bytes() == WHOLE
     run.metrics.write_bytes(WHOLE[:-3])
-    assert run.cut(6500).damaged == 1
+    expected = Expected(["step", "seed", "q"], range(2), first=650, interval=5850)
+    (lost,) = run.cut(6500, expected)
+    assert lost == f"{run.metrics}: 1 damaged line, left out"
     assert run.metrics.read_bytes() == b"".join(LINES[:5])
     run.append(ROWS[2])
     assert run.metrics.read_bytes() == WHOLE
     run.metrics.write_bytes(b"")
-    assert not run.cut(6500).rows and not run.metrics.exists()
+    (lost,) = run.cut(6500, expected)
+    assert "lacks rows between env steps 0 and 6,500" in lost and not run.metrics.exists()
     run.append(ROWS[2])
     assert run.metrics.read_bytes() == LINES[0] + b"".join(LINES[5:])
 
@@ -103,3 +107,27 @@ def test_a_summary_that_is_not_whole_is_none(tmp_path, text):
     assert run.summary() is None
     run.write_summary({"total_steps": 5, "x": float("nan")})
     assert run.summary() == {"total_steps": 5, "x": None}
+
+
+def test_columns_of_other_names_are_named_and_the_rows_to_come_fit(tmp_path):
+    """A header one of whose letters was changed, or of a version with fewer columns."""
+    run = RunDirectory(tmp_path)
+    for row in ROWS[:2]:
+        run.append(row)
+    run.metrics.write_bytes(run.metrics.read_bytes().replace(b"q", b"p", 1))
+    lost = run.cut(6500, Expected(["step", "seed", "q"], range(2), first=650, interval=5850))
+    assert lost == [f"{run.metrics}: no column q: nan in the rows so far"]
+    run.append(ROWS[2])
+    columns = run.read_metrics()
+    assert list(columns) == ["step", "seed", "q"] and np.isnan(columns["q"][:4]).all()
+    np.testing.assert_array_equal(columns["q"][4:].astype(np.float32), ROWS[2]["q"].astype(np.float32))
+
+
+def test_rows_of_seeds_that_a_run_does_not_have_are_damaged(tmp_path):
+    run = RunDirectory(tmp_path)
+    for row in ROWS[:2]:
+        run.append(row)
+    run.metrics.write_bytes(run.metrics.read_bytes().replace(b"650,1,", b"650,7,"))
+    lost = run.cut(6500, Expected(["step", "seed", "q"], range(2), first=650, interval=5850))
+    assert lost[0].endswith(": 1 damaged line, left out") and "between env steps 0 and 6,500" in lost[1]
+    assert set(run.read_metrics()["seed"]) == {0, 1}

@@ -34,7 +34,7 @@ def test_columns():
     (0.99, 390, None),
     (1.0, 1000, r"leaves out 100 % .*positive$"),
 ])  # fmt: skip
-def test_too_short_rollouts_are_told_of(gamma, steps, words):
+def test_too_short_rollouts_are_reported(gamma, steps, words):
     note = overestimation.tail_note([HYPER._replace(gamma=0.5), HYPER._replace(gamma=gamma)], steps)
     assert (note is None) if words is None else re.search(words, note)
 

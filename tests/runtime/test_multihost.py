@@ -1,4 +1,4 @@
-"""Several processes: who they are, what they tell each other, and that a run of theirs is that of one process."""
+"""Several processes: who they are, what they send each other, and that a run of theirs is that of one process."""
 
 import csv
 import json
@@ -70,7 +70,7 @@ def test_settings_name_a_cluster_also_on_slurm():
     assert slurm.detect(GIVEN | {"coordinator_address": "[::1]:80"}, {}).coordinator_address == "[::1]:80"
 
 
-def test_a_port_in_use_and_an_unknown_host_are_told_of(monkeypatch):
+def test_a_port_in_use_and_an_unknown_host_are_reported(monkeypatch):
     monkeypatch.setattr(slurm, "START_SECONDS", 0)
     with socket.create_server(("", 0)) as taken:
         address = f"localhost:{taken.getsockname()[1]}"
@@ -141,7 +141,7 @@ def test_shares_are_neighbors_and_nearly_equal(size):
         Processes(0, size).share(size - 1)
 
 
-# ---- what they tell each other ---------------------------------------------------------------------------------------
+# ---- what they send each other ---------------------------------------------------------------------------------------
 
 
 class Store:

@@ -1,4 +1,4 @@
-"""Errors from outside are told in one line; faults of the program are not taken for them."""
+"""Errors from outside are reported in one line; faults of the program are not taken for them."""
 
 import errno
 import os
@@ -26,15 +26,15 @@ def test_errors_of_the_system_name_the_file(tmp_path):
     assert outside.describe(raised((tmp_path / "none").read_text)) == f"{tmp_path / 'none'}: No such file or directory"
     assert outside.describe(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))) == "No space left on device"
     assert outside.describe(OSError("Cannot call rmtree on a symbolic link")) == "Cannot call rmtree on a symbolic link"
-    told = outside.describe(raised(lambda: os.rename(tmp_path / "a", tmp_path / "b")))
-    assert told == f"{tmp_path / 'a'} -> {tmp_path / 'b'}: No such file or directory"
+    said = outside.describe(raised(lambda: os.rename(tmp_path / "a", tmp_path / "b")))
+    assert said == f"{tmp_path / 'a'} -> {tmp_path / 'b'}: No such file or directory"
     written = ValueError("INTERNAL: Failed writing: \"/x/d\": Failed to write: ... [os_error_code='28']")
     assert outside.describe(written) == "/x/d: No space left on device"
 
 
 def test_memory(tmp_path):
-    told = outside.describe(raised(lambda: np.zeros((10**7, 10**7))))
-    assert told.startswith("out of memory (Unable to allocate") and "take fewer seeds" in told
+    said = outside.describe(raised(lambda: np.zeros((10**7, 10**7))))
+    assert said.startswith("out of memory (Unable to allocate") and "take fewer seeds" in said
     assert outside.describe(MemoryError()).startswith("out of memory: take fewer")
     assert outside.describe(RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 8 bytes")).startswith("out of")
 

@@ -84,7 +84,7 @@ def test_members_learn_with_their_own_numbers(swept):
             assert any(not np.array_equal(one[name], other[name]) for name in one if "critic" in name)
 
 
-def test_a_member_can_be_evaluated_but_not_gone_on_with(swept):
+def test_a_member_can_be_evaluated_but_not_resumed(swept):
     from matd3_jax.cli import evaluate
 
     assert evaluate.main([f"run={swept / 'runs' / 'lr_0.1-tau_0.01'}", "episodes=2"]) == 0

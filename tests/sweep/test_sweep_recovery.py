@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from matd3_jax import config
-from matd3_jax.cli import sweep
+from matd3_jax.cli import command, sweep
 from matd3_jax.errors import UserError
 from matd3_jax.runs import lock
 from matd3_jax.runs.directory import RunDirectory
@@ -15,17 +15,13 @@ from matd3_jax.runtime import files
 from matd3_jax.sweep import runner
 from matd3_jax.sweep.runner import Sweep
 from matd3_jax.training import checkpoint
+from matd3_jax.training.recording import Recorder
 
 TINY = [
     "env=point_reach", "algo=iddpg", "algo.hidden=[4]", "batch_size=8", "num_envs=2", "learning_starts=100",
     "replay_capacity=200", "total_steps=200", "log_every=50", "eval_every=0",
 ]  # fmt: skip
 SWEPT = [*TINY, "algo.lr=0.01,0.1"]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quick(quick_jit):
-    """Every program of this module compiles with little optimization."""
 
 
 @pytest.fixture(scope="module")
@@ -132,6 +128,24 @@ def test_links_that_lead_elsewhere_are_refused_and_nothing_is_changed(copy, link
     with pytest.raises(UserError, match="leads out of"):
         sweep.main([f"resume={copy}"])
     assert contents(copy.parent / "elsewhere") == before
+
+
+def test_a_run_that_has_not_ended_is_resumed_by_its_sweep(copy, capsys):
+    """`train resume=` refuses it, and names the sweep's command; once it has its end it is a run like others."""
+    run = copy / "runs" / "lr_0.01"
+    shutil.rmtree(run / "checkpoints")
+    (run / "summary.json").unlink()
+    before = contents(copy)
+    for name, argument in (("train", f"resume={run}"), ("check", f"run={run}")):
+        code = command.code(lambda argv, name=name: command.start(name, argv), [argument])
+        said = capsys.readouterr()
+        line = [line for line in (said.out + said.err).splitlines() if "resume" in line and "sweep" in line][-1]
+        assert code == (2 if name == "train" else 0)
+        assert line.endswith(f"python -m matd3_jax.sweep resume={copy}"), line
+    assert contents(copy) == before
+    other = copy / "runs" / "lr_0.1"
+    with pytest.raises(UserError, match="raise total_steps="):
+        Recorder().resume(other)
 
 
 def test_what_a_finished_batch_needed_is_deleted_at_the_next_start(copy):

@@ -88,7 +88,7 @@ def test_replay_is_never_copied_in_the_loop(compiled):
 
 
 def test_memory(trainer, compiled):
-    """The replay given in is the replay given out (donated), and the program needs far less beside it."""
+    """The replay given in is the replay given out (donated), and the program needs far less besides."""
     memory = compiled.memory_analysis()
     assert trainer.replay_bytes == 4 * trainer.num_seeds * CAPACITY * trainer.layout.row_size
     assert memory.alias_size_in_bytes >= trainer.replay_bytes

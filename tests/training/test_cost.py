@@ -143,7 +143,7 @@ def test_the_expectation_by_hand(monkeypatch):
         "(products at 2 GFLOP/s measured on these devices, physics 5,700 env steps/s a core)"
     )
     assert 2 < seconds / 60 < 60
-    # Of a run that goes on, what is left.
+    # Of a run that continues, what is left.
     rest = cost.expectation(found, done=warm_up + (total - warm_up) // 2)
     minutes = int(re.search(r"about (\d+) minutes", rest)[1])
     assert minutes < seconds / 60 / 1.5

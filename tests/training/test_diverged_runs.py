@@ -15,6 +15,7 @@ from matd3_jax.cli import evaluate, render, train
 from matd3_jax.errors import UserError
 from matd3_jax.stats.intervals import mean_interval
 from matd3_jax.training import checkpoint
+from matd3_jax.training.loggers import DivergenceLogger
 from matd3_jax.training.recording import Recorder
 from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import networks_finite
@@ -25,8 +26,6 @@ SMALL = [
     "eval_episodes=2",
 ]  # fmt: skip
 LOST, SOUND = 5, (4, 6)
-
-pytestmark = pytest.mark.usefixtures("quick_jit")
 
 
 @pytest.fixture
@@ -47,14 +46,14 @@ def table(path):
         return [row for row in csv.DictReader(file) if int(row["seed"]) != LOST]
 
 
-def test_a_seed_that_diverges_is_told_of_and_left_out(blown, tmp_path, monkeypatch, capsys):
+def test_a_seed_that_diverges_is_reported_and_left_out(blown, tmp_path, monkeypatch, capsys):
     said, path = [], tmp_path / "run"
     recorded = Recorder(say=said.append).start(config.load(SMALL), path)
     (begin,) = {found.step for found in recorded.outcome.diverged.values()}
     assert recorded.outcome.finished and list(recorded.outcome.diverged) == [1]
-    told = [line for line in said if line.startswith(f"seed {LOST} diverged at env step {begin:,}: ")]
-    assert len(told) == 2  # when it happens, and at the end
-    assert told[1].endswith("; all means are over the other 2 seeds")
+    reported = [line for line in said if line.startswith(f"seed {LOST} diverged at env step {begin:,}: ")]
+    assert len(reported) == 2  # when it happens, and at the end
+    assert reported[1].endswith("; all means are over the other 2 seeds")
     assert f"| 2 of 3 seeds, seed {LOST} diverged at {begin:,}" in capsys.readouterr().out
     assert any("(95 % interval over 2 of 3 seeds)" in line for line in said)
     # The means are those of the others' rows.
@@ -78,10 +77,30 @@ def test_a_seed_that_diverges_is_told_of_and_left_out(blown, tmp_path, monkeypat
     with pytest.raises(UserError, match=f"seed={LOST} of .* diverged: .*; they are with seed=4, 6"):
         render.main([f"run={path}", f"seed={LOST}"])
 
-    # What the others learn is what they learn beside a sound seed.
+    # What the others learn is what they learn next to a sound seed.
     monkeypatch.undo()
     Recorder().start(config.load(SMALL), tmp_path / "sound")
     assert table(path) == table(tmp_path / "sound")
+
+
+def test_a_loss_that_is_nan_in_some_updates_of_an_iteration_is_noticed_in_its_interval(monkeypatch):
+    """A row's losses are means without nan; the networks say so at once."""
+    hyper = TrainingSession._hyper
+    monkeypatch.setattr(
+        TrainingSession, "_hyper", lambda *args: hyper(*args)._replace(critic_lr=np.full(3, np.nan, np.float32))
+    )
+    training = TrainingSession(config.load([*SMALL, "updates_per_collect=2", "log_every=20", "eval_every=0"]))
+    state, row = training.start()
+    assert training.iterations_per_interval == 1  # the first loss is sound, the second is not
+    said = []
+    watch = DivergenceLogger(training, said.append)
+    watch.log(row)
+    assert not watch.diverged
+    state, row = training.advance(state)
+    assert np.isfinite(row["agent_0_critic_loss"]).all()
+    watch.log(row)
+    assert len(said) == len(watch.diverged) == 3
+    assert {found.step for found in watch.diverged.values()} == {int(row["step"][0])}
 
 
 def test_stop_ends_the_run_with_a_checkpoint(blown, tmp_path, capsys):
@@ -90,7 +109,7 @@ def test_stop_ends_the_run_with_a_checkpoint(blown, tmp_path, capsys):
     step = checkpoint.steps(tmp_path / "run" / "checkpoints")[-1]
     assert step < 1200 and f"stopped at env step {step:,} since a seed diverged; resume with:" in out
     assert not (tmp_path / "run" / "summary.json").exists() and (tmp_path / "run" / "learning_curve.png").exists()
-    # Resumed, it goes on: no other seed diverges.
+    # Resumed, it continues: no other seed diverges.
     assert train.main([f"resume={tmp_path / 'run'}"]) == 0
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["diverged"] == {str(LOST): step}
 
@@ -112,7 +131,7 @@ def test_from_python_it_is_a_warning(blown):
     assert result.diverged[LOST] == step[~np.isfinite(losses[1]) & (result.metrics["updates"][1] > 0)][0]
 
 
-def test_networks_that_no_loss_tells_of(tmp_path):
+def test_networks_that_no_loss_shows(tmp_path):
     """A weight of -inf before a ReLU leaves outputs finite."""
     settings = config.load(SMALL)
     recorded = Recorder().start(settings, tmp_path / "run")

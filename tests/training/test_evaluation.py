@@ -1,4 +1,4 @@
-"""Evaluation: whole deterministic episodes against NumPy, from fixed start states, beside the training, not in it."""
+"""Evaluation: whole deterministic episodes against NumPy, from fixed start states, apart from the training."""
 
 import collections
 import functools

@@ -91,7 +91,7 @@ def transitions(seed):
 @pytest.mark.parametrize("seed", range(SEEDS))
 def test_transitions_are_exact(seed):
     """Each stored transition is what the environment does with the stored action: reward, the TRUE final observation
-    as x' at an episode's end, discount 0 only where it terminated. Play goes on from x', or from a fresh episode."""
+    as x' at an episode's end, discount 0 only where it terminated. Play continues from x', or from a fresh episode."""
     rows = transitions(seed)
     assert rows.shape == (8 * 4, 3, 7 + 4 + 2 + 7 + 1)  # two rollouts of warm-up, three iterations of two each
     ends = {"terminated": 0, "truncated": 0}

@@ -165,7 +165,7 @@ def test_reward_of_two(name):
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_actors_find_the_best_action(name):
     """The likeliest choice depends on the sign as it should, and nearly surely; the force comes near half of the sign
-    (the reward is flat there: 0.3 beside it costs 0.09 of the 1 between the best force and the worst nearby)."""
+    (the reward is flat there: 0.3 away from it costs 0.09 of the 1 between the best force and the worst nearby)."""
     layout, groups, _ = trained(name)
     for agent in ("choice", "force"):
         i = ENV.agents.index(agent)

@@ -12,7 +12,7 @@ import matd3_jax
 from matd3_jax.runs.divergence import Divergence
 from matd3_jax.training import clock, progress
 from matd3_jax.training.clock import Clock
-from matd3_jax.training.loop import Program
+from matd3_jax.training.program import Program
 from matd3_jax.training.session import TrainingSession
 
 NAN = np.full(2, np.nan)

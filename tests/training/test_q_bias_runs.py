@@ -38,7 +38,7 @@ def finished(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_run_tells_of_it(finished, capsys):
+def test_a_run_reports_it(finished, capsys):
     """Columns at evaluations and nan between them, and before anything was collected; the figure, and the summary."""
     rows = table(finished)
     evaluated = np.array([row["eval_return_agents"] != "nan" for row in rows])

@@ -31,11 +31,6 @@ SMALL = [
 ]  # fmt: skip
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick(quick_jit):
-    """Every program of this module compiles with little optimization."""
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """An unbroken run."""
@@ -83,7 +78,7 @@ def test_there_is_a_checkpoint_right_after_the_warm_up(whole):
 def test_killed_before_its_first_checkpoint(copy, whole):
     shutil.rmtree(copy / "checkpoints")
     (copy / "summary.json").unlink()
-    assert "no checkpoint yet: this run starts anew" in resume(copy)
+    assert "no checkpoint yet: this run starts again" in resume(copy)
     same(copy, whole)
 
 
@@ -109,8 +104,32 @@ def test_killed_after_its_last_checkpoint(copy, whole, left):
         resume(copy)
 
 
+def test_a_metrics_table_that_is_lost_after_the_last_checkpoint_leaves_a_summary(copy):
+    """Without means, as there is nothing to make them of; commands that play with the policies need none."""
+    for name in ("metrics.csv", "learning_curve.png", "summary.json"):
+        (copy / name).unlink()
+    said = resume(copy)
+    step = checkpoint.steps(copy / "checkpoints")[-1]
+    assert sum("lacks rows between env steps" in line for line in said) == 1
+    assert "has no rows: there are no means" in said[-1]
+    assert RunDirectory(copy).summary() == {"total_steps": step, "diverged": {}, "last_tenth": {}}
+    with pytest.raises(UserError, match="raise total_steps="):
+        resume(copy)
+
+
+def test_the_last_rows_that_are_lost_are_not_taken_from_before(copy):
+    """The last tenth and the last evaluation are those of the run's end."""
+    table = copy / "metrics.csv"
+    table.write_bytes(b"".join(table.read_bytes().splitlines(keepends=True)[:-2]))
+    (copy / "summary.json").unlink()
+    assert any("lacks rows between env steps" in line for line in resume(copy))
+    found = RunDirectory(copy).summary()
+    assert found["total_steps"] == checkpoint.steps(copy / "checkpoints")[-1]
+    assert "last_evaluation" not in found and found["last_tenth"] == {}
+
+
 def test_an_older_checkpoint_sets_the_newer_ones_aside(copy, whole):
-    """Killed right after it was resumed from an old checkpoint, a run goes on from there, not from what it left."""
+    """Killed right after it was resumed from an old checkpoint, a run continues from there, not from what it left."""
     first, second, *later = checkpoint.steps(copy / "checkpoints")
     (copy / "summary.json").unlink()
 
@@ -126,6 +145,20 @@ def test_an_older_checkpoint_sets_the_newer_ones_aside(copy, whole):
     assert f"resumed from the checkpoint of env step {first:,}" in said
     same(copy, whole)
     assert not list((copy / "checkpoints").glob("*set_aside"))
+
+
+def test_a_checkpoint_that_is_a_link_is_set_aside_and_what_it_leads_to_stays(copy, whole):
+    """On another disk, say. The link itself is removed with the next checkpoint."""
+    *_, before, last = checkpoint.steps(copy / "checkpoints")
+    place, elsewhere = copy / "checkpoints" / str(last), copy.parent / "elsewhere"
+    place.rename(elsewhere)
+    place.symlink_to(elsewhere)
+    kept = {path: path.read_bytes() for path in elsewhere.rglob("*") if path.is_file()}
+    (copy / "summary.json").unlink()
+    assert f"resumed from the checkpoint of env step {before:,}" in resume(copy, step=before)
+    same(copy, whole)
+    assert {path: path.read_bytes() for path in elsewhere.rglob("*") if path.is_file()} == kept
+    assert all(path.is_dir() and not path.is_symlink() for path in (copy / "checkpoints").iterdir())
 
 
 DAMAGES = {
@@ -285,17 +318,17 @@ def test_a_signal_is_noted_while_something_is_printed(monkeypatch):
     """The handler itself prints nothing: it may run in the middle of a print."""
     from matd3_jax.runtime import signals
 
-    told = threading.Event()
-    monkeypatch.setattr(signals, "note", lambda line: told.set())
+    noted = threading.Event()
+    monkeypatch.setattr(signals, "note", lambda line: noted.set())
     before = {name: signal.getsignal(getattr(signal, name)) for name in signals.NAMES}
     try:
         stop = signals.Stop()
         main = threading.current_thread()
         printed = []
-        monkeypatch.setattr(signals, "note", lambda line: (printed.append(threading.current_thread()), told.set()))
+        monkeypatch.setattr(signals, "note", lambda line: (printed.append(threading.current_thread()), noted.set()))
         signal.raise_signal(signal.SIGHUP)
         assert stop.signal == signal.SIGHUP
-        assert told.wait(10) and printed[0] is not main
+        assert noted.wait(10) and printed[0] is not main
         with pytest.raises(SystemExit) as ended:
             signal.raise_signal(signal.SIGTERM)
         assert ended.value.code == 128 + signal.SIGTERM

@@ -63,7 +63,7 @@ OPTIONS = (
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("env", "seeds"), [("ant", 3), ("humanoid", 1)])
-def test_a_resumed_robot_goes_on_to_the_bit(env, seeds, tmp_path):
+def test_a_resumed_robot_is_the_same_to_the_bit(env, seeds, tmp_path):
     """With C physics, whatever carries state: the solver's start, noise quantiles, averaged actors, the reservoir."""
     settings = config.load([f"env={env}", "env.physics=c", *OPTIONS, f"seeds={seeds}", "total_steps=400"])
 

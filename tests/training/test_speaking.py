@@ -77,7 +77,7 @@ def test_updates_move_movement_and_word(name):
 class Telling(Environment):
     """One env step: sees a number from 0 to 2, and is paid for the move and for the word that stand for it.
 
-    The move is the number's parity, so that neither part tells the other.
+    The move is the number's parity, so that neither part gives the other away.
     """
 
     agents: tuple[str, ...] = ("speaker",)  # type: ignore[misc]

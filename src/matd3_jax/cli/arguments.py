@@ -35,7 +35,7 @@ class Train(OfProcesses):
 
     resume: Path | None = option("resume this run; total_steps= may be raised", default=None, metavar="RUN_DIR")
     checkpoint: int | None = option(
-        "with resume: go on from the checkpoint of this env step", default=None, least=0, otherwise="the last"
+        "with resume: start from the checkpoint of this env step", default=None, least=0, otherwise="the last"
     )
     cfg: bool = flag("--cfg", "print the resolved settings and stop")
     settings: tuple[str, ...] = others("a setting, in Hydra's grammar; name= and out= as typed")
@@ -177,7 +177,7 @@ class Plot:
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """Say what a run directory holds, what of it is damaged, and how to go on with it. Changes nothing.
+    """Say what a run directory holds, what of it is damaged, and how to resume it. Changes nothing.
 
     Exit code: 0 where nothing is damaged, 1 where something is and the run can be resumed, 2 where there is no run.
     """

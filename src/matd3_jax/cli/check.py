@@ -1,4 +1,4 @@
-"""`python -m matd3_jax.check run=RUN_DIR`: what a run directory, or a sweep's, holds, and how to go on with it."""
+"""`python -m matd3_jax.check run=RUN_DIR`: what a run directory, or a sweep's, holds, and how to resume it."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -39,7 +39,7 @@ def of_sweep(folder: Path) -> int:
     """Say the condition of a sweep, of its batches and of their runs."""
     if Sweep(folder).unfinished_plan():
         say(f"sweep directory: {folder}\ndamaged: its planning was cut short\n"
-            "go on with: the command that started it, with the same name=")  # fmt: skip
+            "start it again: with the same command and the same name=")  # fmt: skip
         return 1
     sweep, _ = open_sweep(folder)
     batches, problems = sweep.batches, 0
@@ -69,7 +69,7 @@ def of_sweep(folder: Path) -> int:
         _tell([], wrong)
         problems += len(wrong)
     line = command.line("matd3_jax.sweep", resume=folder)
-    say(f"go on with: {line}" if left else f"finished; make its table anew with: {line}")
+    say(f"resume with: {line}" if left else f"finished; make its table again with: {line}")
     return int(problems > 0)
 
 
@@ -86,11 +86,13 @@ def _way_on(found: Condition) -> str:
         return f"wait for its end, or stop it: {found.holder} works in it"
     if found.damaged and not found.whole:
         return (
-            f"no checkpoint can be read: take {found.run.checkpoints} away to train anew with: "
+            f"no checkpoint can be read: take {found.run.checkpoints} away and train from the start with: "
             f"{command.line('matd3_jax.train', resume=path)}"
         )
     if found.finished and not found.needs_step:
         return f"finished; evaluate with: {command.line('matd3_jax.evaluate', run=path)}"
+    if not found.whole and found.run.sweep is not None:
+        return f"its sweep trains it; resume with: {command.line('matd3_jax.sweep', resume=found.run.sweep)}"
     step = {"checkpoint": found.resumable_from} if found.needs_step else {}
     start = "" if found.whole else " (from the start)"
-    return f"go on with: {command.line('matd3_jax.train', resume=path, **step)}{start}"
+    return f"resume with: {command.line('matd3_jax.train', resume=path, **step)}{start}"

@@ -55,7 +55,7 @@ def _progress(cells: Sequence[tuple[int, int]]) -> Iterable[tuple[int, int]]:
     return track(cells, "playing", console=console, transient=True, disable=not console.is_terminal)
 
 
-# ---- telling ---------------------------------------------------------------------------------------------------------
+# ---- output ---------------------------------------------------------------------------------------------------------
 
 
 def _print(pairings: Pairings, names: Sequence[str], title: str) -> None:

@@ -119,7 +119,7 @@ def _tell(
     shortest, farthest = found.ends.min(), found.ends.max()
     if farthest - found.x[-1] > 2 * np.diff(found.x, prepend=0).max():
         early = ", ".join(f"{seed:.0f}" for seed in found.seeds[found.ends == shortest])
-        say(f"  drawn up to there because the values with seed {early} end; others go on to {farthest:,.0f}")
+        say(f"  drawn up to there because the values with seed {early} end; others reach {farthest:,.0f}")
     if diverged:
         say(f"  {divergence.which(diverged)}: values from there on are left out")
 

@@ -13,6 +13,7 @@ from matd3_jax.config import Config
 from matd3_jax.errors import UserError, nearest
 from matd3_jax.figures import sweep as sweep_figure
 from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.runs.paths import inside
 from matd3_jax.runtime import devices, files, multihost, slurm
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.terminal import say
@@ -52,7 +53,7 @@ def start(given: SweepOptions, argv: Sequence[str], processes: Processes) -> int
     chosen, settings = read(given.settings, given.samples, given.sample_seed)
     metric = given.metric or METRIC
     check_metric(settings.values(), metric)
-    folder = given.out / (given.name or f"sweep-{time.strftime('%Y%m%d-%H%M%S')}")
+    folder = inside(given.out, given.name or f"sweep-{time.strftime('%Y%m%d-%H%M%S')}", "name")
     if processes.first:
         facts = {
             "command": command.line("matd3_jax.sweep", *argv),

@@ -8,6 +8,7 @@ from matd3_jax import config
 from matd3_jax.cli import arguments, command, options
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError
+from matd3_jax.runs.paths import inside
 from matd3_jax.runtime import devices, multihost, slurm
 from matd3_jax.runtime.terminal import say
 from matd3_jax.training.recording import Recorded, Recorder
@@ -46,7 +47,7 @@ def _train(recorder: Recorder, given: arguments.Train) -> Recorded:
         raise UserError("checkpoint= goes with resume=RUN_DIR")
     settings = config.load(given.settings, arguments.TRAIN.keys)
     name = settings.name or _name(settings)
-    return recorder.start(settings, Path(settings.out) / name, or_another=not settings.name)
+    return recorder.start(settings, inside(Path(settings.out), name, "name"), or_another=not settings.name)
 
 
 def _total_steps(overrides: Sequence[str]) -> int | None:

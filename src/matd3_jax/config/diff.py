@@ -37,9 +37,9 @@ def label_differences(configs: Sequence[Config]) -> list[str]:
 
     Environment and algorithms come first, by name (`simple_tag, matd3 vs maddpg`). Other keys follow as `key=value`
     where they differ between runs of the same names, or where some run has another value than its names bring along
-    (so `matd3` and `maddpg` are not also told apart by `num_critics=2` and `num_critics=1`). A learning rate that is
-    the same for actor and critic is `lr`. Runs that learn alike are told apart by their seeds, then by what they leave
-    behind, at last by a number. Where nothing differs (one run, say) the name is that of the algorithms.
+    (so `matd3` and `maddpg` are not also distinguished by `num_critics=2` and `num_critics=1`). A learning rate that is
+    the same for actor and critic is `lr`. Runs that learn alike are distinguished by their seeds, then by what they
+    leave behind, at last by a number. Where nothing differs (one run, say) the name is that of the algorithms.
     """
     settings = [learning(config) for config in configs]
     keys = differing(settings)
@@ -139,9 +139,9 @@ def _told_apart(labels: Sequence[str], more: Sequence[str]) -> list[str]:
     groups: dict[str, list[int]] = {}
     for i, label in enumerate(labels):
         groups.setdefault(label, []).append(i)
-    told = list(labels)
+    found = list(labels)
     for label, members in groups.items():
         if len({more[i] for i in members}) > 1:
             for i in members:
-                told[i] = ", ".join(part for part in (label, more[i]) if part)
-    return told
+                found[i] = ", ".join(part for part in (label, more[i]) if part)
+    return found

@@ -106,7 +106,7 @@ class AlgoConfig:
 
 @dataclasses.dataclass(frozen=True)
 class DiagnosticsConfig:
-    """What a run measures of itself beside its returns; config.yaml says what each means."""
+    """What a run measures of itself besides its returns; config.yaml says what each means."""
 
     q_bias: bool = setting(BOOKKEEPING, before=False)
     q_bias_rollouts: int = setting(BOOKKEEPING, least=1, before=200)

@@ -190,8 +190,8 @@ class RowParts:
     action: chex.Array
     reward: chex.Array
     more: chex.Array | None
-    """Whether the episode goes on; in rows that `n_step.draw` gives, how many steps of a return follow the first. None
-    with n_step = 1."""
+    """Whether the episode continues; in rows that `n_step.draw` gives, how many steps of a return follow the first.
+    None with n_step = 1."""
     next_x: chex.Array
     discount: chex.Array
 

@@ -1,4 +1,4 @@
-"""Overestimation measured: the critics' estimates beside the true discounted returns (PAPER section 3).
+"""Overestimation measured: the critics' estimates compared with the true discounted returns (PAPER section 3).
 
 A reservoir keeps states and joint actions collected since the last evaluation, each with the whole state of its
 environment. From there the true value is played out: the stored action, then the policies as they are now. For one

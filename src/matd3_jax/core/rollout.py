@@ -87,7 +87,7 @@ def collect(
     keep_states: bool = False,
     unroll: int = 1,
 ) -> tuple[EnvState, chex.Array, Episodes, Any]:
-    """Play `length` steps in every environment with the exploring policies; episodes that end start anew.
+    """Play `length` steps in every environment with the exploring policies; episodes that end are followed by others.
 
     Returns the environments, the replay rows [length * num_envs, row_size] (the true next observation in them, also
     where an episode ended), what ended on the way, and the state of the environment before each row's action, leading

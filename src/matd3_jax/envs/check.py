@@ -13,6 +13,9 @@ from matd3_jax.errors import UserError
 
 TEAMS = ("agents", "adversaries")
 
+SEPARATORS = ',"'
+"""Of columns in the tables that have the names of agents and measures in their headers."""
+
 
 def check(env: Environment) -> None:
     """Raise UserError for the first thing about an environment that breaks the contract.
@@ -48,6 +51,10 @@ class _Check:
             self.fail(f"agents is {agents!r}; must be a tuple of at least one name")
         if len(set(agents)) < len(agents):
             self.fail(f"agents is {agents!r}; names must differ")
+        for field, names in (("agents", agents), ("measures", env.measures)):
+            for name in names:
+                if not name.isprintable() or {*name} & {*SEPARATORS}:
+                    self.fail(f"{field} has {name!r}; names must do without commas, quotation marks and line ends")
         for field in ("teams", "observation_sizes", "action_spaces", "return_weights"):
             value = getattr(env, field)
             if not isinstance(value, tuple) or len(value) != len(agents):

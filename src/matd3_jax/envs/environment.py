@@ -38,7 +38,7 @@ class Environment(abc.ABC):
     @property
     @abc.abstractmethod
     def agents(self) -> tuple[str, ...]:
-        """Names of the agents, in the order of every per-agent tuple and array."""
+        """Names of the agents, in the order of every per-agent tuple and array; without commas and quotation marks."""
 
     @property
     def teams(self) -> tuple[str, ...]:

@@ -60,7 +60,7 @@ class JaxMARL:
     def step(
         self, key: chex.PRNGKey, state: Any, actions: dict[str, chex.Array], reset_state: Any | None = None
     ) -> tuple[dict[str, chex.Array], Any, dict[str, chex.Array], dict[str, chex.Array], dict[str, Any]]:
-        """(observations, state, rewards, dones, infos); starts anew, from `reset_state` if given, when all are done."""
+        """(observations, state, rewards, dones, infos); when all are done from `reset_state`, or from a reset."""
         key, key_reset = jax.random.split(key)
         observation, stepped, rewards, dones, infos = self.step_env(key, state, actions)
         if reset_state is None:

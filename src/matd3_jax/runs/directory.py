@@ -18,11 +18,16 @@ from matd3_jax.config.diff import differing, learning, text
 from matd3_jax.errors import UserError
 from matd3_jax.runs import metrics_table
 from matd3_jax.runs.metrics_table import MetricsTable
+from matd3_jax.runs.missing import Expected
 from matd3_jax.runs.paths import check_directory
 from matd3_jax.runtime import files
 
 FORMAT = 1
 """Of what a run directory holds, in its machine.json; directories without it are of format 0, and are read, too."""
+
+
+PLANS = ("batches", "pieces")
+"""What a sweep's file of its batches, and their folder, are called; in older ones the latter."""
 
 
 class RunDirectory:
@@ -42,7 +47,7 @@ class RunDirectory:
 
     @staticmethod
     def check_new(path: Path, or_another: bool = False) -> None:
-        """Raise UserError where no directory for a run, or a sweep, can be made anew. Makes nothing.
+        """Raise UserError where no directory for a run, or a sweep, can be made. Makes nothing.
 
         or_another: another one (see `create`) will do where this is there.
         """
@@ -113,6 +118,20 @@ class RunDirectory:
         return number if isinstance(number, int) else 0
 
     @property
+    def sweep(self) -> Path | None:
+        """The directory of the sweep that plans this run, and trains it with others; None: it is no sweep's."""
+        path = self.path.resolve()
+        folder = path.parent.parent
+        for plan in (folder / f"{name}.json" for name in PLANS if path.parent.name == "runs"):
+            try:
+                batches = json.loads(plan.read_text(encoding="utf-8"))
+                if any(path.name in batch for batch in batches):
+                    return folder
+            except (OSError, ValueError, TypeError, RecursionError):
+                continue
+        return None
+
+    @property
     def bare(self) -> bool:
         """Whether the directory was made, and nothing has been trained in it."""
         if self.path.is_symlink() or not self.path.is_dir():
@@ -121,7 +140,7 @@ class RunDirectory:
         return {found.name for found in self.path.iterdir()} <= own
 
     def clean(self) -> None:
-        """Take away what killed writes left beside the files, while the lock of the directory is held.
+        """Take away the partial files that killed writes left, while the lock of the directory is held.
 
         Raises UserError where what is written in place is a link: what is behind it is not the run's.
         """
@@ -142,20 +161,30 @@ class RunDirectory:
             files.sync_folder(self.path)
 
     def clear(self) -> None:
-        """Take away all but settings and machine: the run begins anew."""
+        """Take away all but settings and machine: the run starts again."""
         for path in (self.metrics, self.curve, self.path / "summary.json"):
             path.unlink(missing_ok=True)
         shutil.rmtree(self.checkpoints, ignore_errors=True)
 
-    def cut(self, step: int) -> MetricsTable:
-        """Drop the rows after env step `step`, which will be written again, and the lines that are not whole: what the
-        table has then, and how many damaged lines it had."""
-        kept = self.table().until(step)
+    def cut(self, step: int, expected: Expected | None = None) -> list[str]:
+        """Drop the rows after env step `step`, which will be written again, and the lines that are not whole.
+
+        Args:
+            expected: of the table: gives it the columns of the rows to come.
+
+        Returns:
+            What the table lacks, a line for each kind of loss.
+        """
+        kept = self.table()
+        lines = [] if expected is None else [f"{self.metrics}: {line}" for line in expected.lines(kept, step)]
+        kept = kept.until(step)
+        if expected is not None:
+            kept = expected.seen(kept).with_columns(expected.columns)
         if kept.rows:
             files.write_text(self.metrics, kept.text())
         else:
             self.metrics.unlink(missing_ok=True)
-        return kept
+        return lines
 
     def table(self) -> MetricsTable:
         """The whole rows of the metrics table; none where there is no file."""
@@ -167,9 +196,12 @@ class RunDirectory:
         Raises UserError if there is none yet.
         """
         table = self.table()
-        if not table.rows:
+        columns = table.columns()
+        if not table.rows and not table.damaged:
             raise UserError(f"{self.path} has no metrics yet: its first row comes when learning starts")
-        return table.columns()
+        if not columns or not columns["step"].size:
+            raise UserError(f"no row of {self.metrics} can be read: it is damaged")
+        return columns
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         files.write_json(self.path / "summary.json", summary)
@@ -184,7 +216,7 @@ class RunDirectory:
 
 
 def _there(path: Path) -> str:
-    return f"{path} is there already: choose another name=, or go on with {shlex.quote(f'resume={path}')}"
+    return f"{path} is there already: choose another name=, or resume it with {shlex.quote(f'resume={path}')}"
 
 
 def together(paths: Sequence[Path]) -> dict[str, np.ndarray]:

@@ -9,6 +9,9 @@ from pathlib import Path
 from matd3_jax import lists
 from matd3_jax.errors import UserError
 
+LONGEST_NAME = 255
+"""Bytes of a file's name, on all usual file systems."""
+
 
 def paths(texts: Sequence[str], key: str = "runs") -> tuple[Path, ...]:
     """The run directories that the texts after `key=` name.
@@ -30,7 +33,31 @@ def paths(texts: Sequence[str], key: str = "runs") -> tuple[Path, ...]:
 
 def is_name(value: object) -> bool:
     """Whether a value from a file can be the name of a directory in another: one part of a path, that leads nowhere."""
-    return isinstance(value, str) and value == Path(value).name and value not in ("", "..") and not {*value} & {*"\\\0"}
+    return isinstance(value, str) and _is_part(value) and value == Path(value).name and "\\" not in value
+
+
+def inside(parent: Path, name: str, key: str) -> Path:
+    """The directory `name` in another one; a name with slashes stands for directories within each other.
+
+    Raises UserError, naming the option `key`, where it would not be inside.
+    """
+    found = parent / name
+    if Path(name).is_absolute() or not all(map(_is_part, Path(name).parts or ("",))):
+        raise UserError(f"{key}={name}: must name a directory in {parent}")
+    return found
+
+
+def _is_part(name: str) -> bool:
+    """Whether a text can be one part of a path, which does not lead up."""
+    return _has_bytes(name) and 0 < len(os.fsencode(name)) <= LONGEST_NAME and name not in (".", "..")
+
+
+def _has_bytes(name: str) -> bool:
+    """Whether the system can take a text as a file's name at all, of whatever length."""
+    try:
+        return "\0" not in name and os.fsencode(name) is not None
+    except UnicodeEncodeError:
+        return False
 
 
 def check_new_directory(path: Path, key: str) -> None:
@@ -46,6 +73,8 @@ def check_directory(path: Path, key: str) -> None:
     Args:
         key: of the option that names it, for the message.
     """
+    if not _has_bytes(str(path)):
+        raise UserError(f"{key}={path}: cannot make this directory: no file can have this name")
     try:
         if path.exists() and not path.is_dir():
             raise UserError(f"{key}={path}: cannot make this directory: a file has this name")

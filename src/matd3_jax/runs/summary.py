@@ -11,13 +11,14 @@ from matd3_jax.stats.intervals import mean_interval
 from matd3_jax.stats.text import plus_minus
 
 
-def finals(metrics: dict[str, np.ndarray]) -> dict[str, tuple[float, float | None]]:
+def finals(metrics: dict[str, np.ndarray], done: int) -> dict[str, tuple[float, float | None]]:
     """For each team `final` of the mean training return in the last tenth of the run, if all seeds ended episodes.
 
     Args:
         metrics: columns [rows] of the metrics table, without seeds that diverged.
+        done: env step of the run's end.
     """
-    late = metrics["step"] > 0.9 * metrics["step"].max(initial=0)
+    late = metrics["step"] > 0.9 * done
     finals = {}
     for name in (name for name in metrics if name.startswith("return_")):
         there = late & ~np.isnan(metrics[name])  # long episodes need not end within an interval
@@ -27,20 +28,28 @@ def finals(metrics: dict[str, np.ndarray]) -> dict[str, tuple[float, float | Non
     return finals
 
 
-def summary(metrics: dict[str, np.ndarray], diverged: Mapping[int, Divergence], **facts: Any) -> dict[str, Any]:
+def summary(
+    metrics: dict[str, np.ndarray], done: int, diverged: Mapping[int, Divergence], **facts: Any
+) -> dict[str, Any]:
     """What a run leaves in summary.json at its end: means over the seeds that did not diverge; no means without any.
 
     Args:
         metrics: columns [rows] of its metrics table.
+        done: env step of the run's end.
     """
-    steps = {str(seed): found.step for seed, found in diverged.items()}
     sound = divergence.without(metrics, diverged)
-    found = {"total_steps": int(metrics["step"].max()), **facts, "diverged": steps, "last_tenth": finals(sound)}
+    found = {**without_metrics(done, diverged, **facts), "last_tenth": finals(sound, done)}
     evaluated = [name for name in metrics if name.startswith("eval_") or name.endswith("_eval_return")]
-    if evaluated and sound["step"].size:
-        last = sound["step"] == sound["step"].max()
+    last = sound["step"] == done
+    if evaluated and last.any():
         found["last_evaluation"] = {name.replace("eval_", "", 1): final(sound[name][last]) for name in evaluated}
     return found
+
+
+def without_metrics(done: int, diverged: Mapping[int, Divergence], **facts: Any) -> dict[str, Any]:
+    """The summary of a run whose metrics table was lost: it has no means."""
+    steps = {str(seed): found.step for seed, found in diverged.items()}
+    return {"total_steps": done, **facts, "diverged": steps, "last_tenth": {}}
 
 
 def final(values: np.ndarray) -> tuple[float, float | None]:

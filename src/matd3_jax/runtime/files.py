@@ -15,7 +15,7 @@ from typing import Any
 from matd3_jax.errors import UserError
 
 PARTIAL = re.compile(r"\..+\.\d+\.partial(\.\w+)?")
-"""Names of the files that `replacing` writes beside those that they replace."""
+"""Names of the files that `replacing` writes, until they replace the old ones."""
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""What a program tells its user: never a reason to end."""
+"""Output to the user: never a reason to end."""
 
 import contextlib
 import io

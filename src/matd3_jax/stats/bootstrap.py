@@ -1,6 +1,6 @@
 """Statistics over seeds with intervals by the bootstrap (Efron 1979), stratified over tasks (Agarwal et al. 2021).
 
-Intervals are percentiles of the statistic over resamples: each task's runs are drawn anew from that task's runs, with
+Intervals are percentiles of the statistic over resamples: each task's runs are resampled from that task's runs, with
 replacement, as rliable does. The same seed gives the same interval. Fewer than two runs of a task say nothing about the
 spread: the ends are nan then. Averages over a nan (a run that diverged) are nan, with their intervals; it is never left
 out. In what only compares scores (probability of improvement, performance profiles) it loses against every number.

@@ -17,7 +17,7 @@ import numpy as np
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError
 from matd3_jax.runs import divergence, lock
-from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.runs.directory import PLANS, RunDirectory
 from matd3_jax.runs.paths import is_name
 from matd3_jax.runtime import devices, files
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
@@ -29,7 +29,8 @@ from matd3_jax.training import run as training_run
 from matd3_jax.training.loggers import DivergenceLogger, Logger, TableLogger, TensorBoardLogger
 from matd3_jax.training.memory import most_seeds, needed
 from matd3_jax.training.progress import ProgressBar
-from matd3_jax.training.session import Row, TrainingSession
+from matd3_jax.training.rows import Row
+from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import TrainState
 
 
@@ -44,8 +45,7 @@ class Sweep:
     def __init__(self, folder: Path, processes: Processes = SINGLE_PROCESS):
         self.folder, self.processes = folder, processes
         self.runs = folder / "runs"
-        # Older sweeps called their batches pieces.
-        self._name = "pieces" if (folder / "pieces.json").exists() else "batches"
+        self._name = next((name for name in reversed(PLANS) if (folder / f"{name}.json").exists()), PLANS[0])
         self._plan = folder / f"{self._name}.json"
 
     @property
@@ -237,7 +237,7 @@ class Batch:
         self._finish(outcome.state, outcome.row, {"seconds": round(time.monotonic() - begun, 1), **rates})
 
     def _begin(self) -> tuple[TrainState, Row, bool]:
-        """The state to go on from, its row, and whether nothing was trained yet."""
+        """The state to train from, its row, and whether nothing was trained yet."""
         first, broadcast = self.processes.first, self.processes.broadcast
         for run in self.runs if first else ():
             run.clean()
@@ -256,7 +256,8 @@ class Batch:
         state, done = checkpoint.restore(saved, self.training.trainer, self.training.share), int(saved.name)
         self.processes.barrier()
         for run, config, own in zip(self.runs, self.members, self.seeds, strict=True) if first else ():
-            run.cut(done)
+            for line in run.cut(done, self.training.expected_table(config)):
+                say(f"note: {line}")
             known = divergence.of_run(run, done)
             self.watch.diverged |= {own.start + seed - config.seed: found for seed, found in known.items()}
         if first:
@@ -266,10 +267,10 @@ class Batch:
 
     def _finish(self, state: TrainState, row: Row, facts: Mapping[str, Any]) -> None:
         """Leave each run as if it had been trained alone, but for its replay."""
-        trainer, share = self.training.trainer, self.training.share
+        trainer, share, done = self.training.trainer, self.training.share, int(row["step"][0])
         facts = {**facts, "side_by_side": share.total}
         for run, config, seeds in zip(self.runs, self.members, self.seeds, strict=True):
-            checkpoint.save(run.checkpoints, int(row["step"][0]), trainer, state, keep=1, seeds=seeds, share=share)
+            checkpoint.save(run.checkpoints, done, trainer, state, keep=1, seeds=seeds, share=share)
             if not self.processes.first:
                 continue
             diverged = {
@@ -277,7 +278,8 @@ class Batch:
                 for place, found in self.watch.diverged.items()
                 if seeds.start <= place < seeds.stop
             }
-            finish.finish(run, self.training.layout, str(config.name), config.diagnostics.q_bias, facts, diverged)
+            settings = str(config.name), config.diagnostics.q_bias
+            finish.finish(run, self.training.layout, *settings, done, facts, diverged)
 
     def _announce(self) -> None:
         training, config = self.training, self.members[0]

@@ -151,5 +151,5 @@ def names(axes: Sequence[Axis], settings: Sequence[dict[str, str]]) -> list[str]
     for k, setting in enumerate(settings):
         name = "-".join(f"{short}_{value}" for short, value in zip(shorts, setting.values(), strict=True))
         name = "".join(c for c in name.replace(",", "x") if c.isalnum() or c in ".+-_")
-        found.append(name if 0 < len(name) <= 120 else f"setting_{k:04d}")
+        found.append(name if 0 < len(name.encode()) <= 120 else f"setting_{k:04d}")
     return found if len(set(found)) == len(found) else [f"setting_{k:04d}" for k in range(len(found))]

@@ -40,6 +40,9 @@ def last_lines(
     """Say what a finished run's summary holds, and of which seeds."""
     settings = training.config
     lines = [f"seed {seed} diverged at env step {one.step:,}: {one.what}" for seed, one in diverged.items()]
+    if not run.table().rows:
+        lost = f"{run.metrics} has no rows: there are no means and no learning curve; see matd3_jax.evaluate"
+        return [*lines, lost]
     left = settings.seeds - len(diverged)
     over = f"(95 % interval over {settings.seeds} seeds)"
     if diverged and not left:

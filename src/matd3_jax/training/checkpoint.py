@@ -94,7 +94,7 @@ def save(
         for old in steps(folder)[:-keep]:
             _remove(folder / str(old))
         for aside in folder.glob(f"*{ASIDE}"):
-            shutil.rmtree(aside, ignore_errors=True)
+            _remove(aside)
     return final
 
 
@@ -118,7 +118,7 @@ def set_aside_after(folder: Path, step: int) -> None:
 
 def _aside(path: Path) -> None:
     aside = path.with_name(f"{path.name}{ASIDE}")
-    shutil.rmtree(aside, ignore_errors=True)
+    _remove(aside)
     path.rename(aside)
 
 

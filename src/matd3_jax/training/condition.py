@@ -9,6 +9,7 @@ from matd3_jax.errors import OptionError, UserError
 from matd3_jax.runs import lock
 from matd3_jax.runs.directory import FORMAT, RunDirectory
 from matd3_jax.runs.metrics_table import MetricsTable
+from matd3_jax.runs.missing import Expected
 from matd3_jax.runtime import files
 from matd3_jax.training import checkpoint
 from matd3_jax.training.session import TrainingSession
@@ -39,7 +40,7 @@ class Condition:
 
     @property
     def resumable_from(self) -> int | None:
-        """Env step of the last checkpoint that is whole; None: the run starts anew."""
+        """Env step of the last checkpoint that is whole; None: the run starts again."""
         return self.whole[-1] if self.whole else None
 
     @property
@@ -77,14 +78,13 @@ def of_run(path: Path) -> Condition:
     found = {step: checkpoint.damage(run.checkpoints / str(step)) for step in checkpoint.steps(run.checkpoints)}
     damaged = {step: why for step, why in found.items() if why is not None}
     whole = tuple(step for step, why in found.items() if why is None)
-    table = run.table()
+    table, done = run.table(), whole[-1] if whole else 0
+    expected = _expected(settings, table)
     problems = [f"checkpoint {step:,} is damaged ({why})" for step, why in damaged.items()]
-    if table.damaged:
-        problems.append(f"{run.metrics}: {table.damaged} damaged line{'s' * (table.damaged > 1)}, left out by a resume")
-    gaps = tuple(_gaps(settings, table, whole[-1] if whole else 0))
-    problems += [f"{run.metrics} lacks rows between env steps {a:,} and {b:,}" for a, b in gaps]
+    problems += [f"{run.metrics}: {line}" for line in expected.lines(table, done)]
+    gaps = tuple(expected.gaps(table, done))
     if (run.path / "summary.json").exists() and run.summary() is None:
-        problems.append(f"{run.path / 'summary.json'} is not whole: a resume makes it anew")
+        problems.append(f"{run.path / 'summary.json'} is not whole: a resume makes it again")
     if not _readable(run.path / "machine.json"):
         problems.append(f"{run.path / 'machine.json'} is missing or not whole: versions and devices are lost")
     for link in (run.metrics, run.checkpoints, run.tensorboard):
@@ -93,16 +93,13 @@ def of_run(path: Path) -> Condition:
     return Condition(run, settings, whole, damaged, table, gaps, lock.holder(run.path), tuple(problems))
 
 
-def _gaps(settings: Config, table: MetricsTable, done: int) -> list[tuple[int, int]]:
-    """Where rows are missing up to the checkpoint of env step `done`, as a resume will say."""
-    if not done:
-        return []
+def _expected(settings: Config, table: MetricsTable) -> Expected:
+    """What the metrics table should have, as a resume will say."""
     try:
-        training = TrainingSession(settings)
+        return TrainingSession(settings).expected_table(settings)
     except (UserError, OptionError):  # an environment of one's own, or one that is not installed here
-        return table.gaps(0, done, done, settings.seeds) if not table.rows else []
-    first, interval = training.trainer.schedule.warmup_steps, training.interval_steps
-    return table.until(done).gaps(first, done, interval, settings.seeds)
+        seeds = range(settings.seed, settings.seed + settings.seeds)
+        return Expected(table.header, seeds, first=0, interval=0)
 
 
 def _readable(path: Path) -> bool:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from matd3_jax.core.agents import JointLayout
+from matd3_jax.errors import UserError
 from matd3_jax.figures import learning_curves, q_bias
 from matd3_jax.runs import divergence, overestimation, summary
 from matd3_jax.runs.directory import RunDirectory
@@ -15,11 +16,18 @@ from matd3_jax.runs.divergence import Divergence
 def draw(
     run: RunDirectory, layout: JointLayout, title: str, with_q_bias: bool, diverged: Mapping[int, Divergence]
 ) -> None:
-    """Draw the figures of a run as far as it has come; means without the seeds that diverged.
+    """Draw the figures of a run as far as it has come; means without the seeds that diverged."""
+    metrics = _metrics(run)
+    if metrics:
+        _draw(run, metrics, layout, title, with_q_bias, diverged)
 
-    Raises UserError where it has no metrics yet.
-    """
-    _draw(run, run.read_metrics(), layout, title, with_q_bias, diverged)
+
+def _metrics(run: RunDirectory) -> dict[str, np.ndarray]:
+    """The columns of a run's metrics table; none where it was lost."""
+    try:
+        return run.read_metrics()
+    except UserError:
+        return {}
 
 
 def _draw(
@@ -43,21 +51,27 @@ def finish(
     layout: JointLayout,
     title: str,
     with_q_bias: bool,
+    done: int,
     facts: Mapping[str, Any],
     diverged: Mapping[int, Divergence],
 ) -> dict[str, Any]:
     """Draw the figures of a run that has come to its end, and write its summary, which is returned.
 
+    Where its metrics table was lost there are no figures, and no means in the summary.
+
     Args:
+        done: env step of its end.
         facts: times and rates, which only the process that trained knows.
         diverged: what that process found; the table's own are found again.
-
-    Raises UserError where it has no metrics.
     """
-    metrics = run.read_metrics()
+    metrics = _metrics(run)
+    if not metrics:
+        lost = summary.without_metrics(done, diverged, **facts)
+        run.write_summary(lost)
+        return lost
     diverged = divergence.earliest(divergence.of_table(metrics), diverged)
     sound = _draw(run, metrics, layout, title, with_q_bias, diverged)
-    found = summary.summary(metrics, diverged, **facts)
+    found = summary.summary(metrics, done, diverged, **facts)
     if with_q_bias and sound["step"].size:
         found["overestimation"] = overestimation.summary(sound, layout.agents)
     run.write_summary(found)

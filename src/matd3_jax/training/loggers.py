@@ -10,7 +10,8 @@ from matd3_jax.errors import UserError
 from matd3_jax.runs import divergence
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runs.divergence import Divergence
-from matd3_jax.training.session import Row, TrainingSession
+from matd3_jax.training.rows import Row
+from matd3_jax.training.session import TrainingSession
 
 
 class Logger(Protocol):
@@ -68,10 +69,10 @@ class TensorBoardLogger:
 
 
 class DivergenceLogger:
-    """Notes which seeds diverged, and tells of each once.
+    """Notes which seeds diverged, and reports each once.
 
     Args:
-        tell: gets a line the moment a seed diverges.
+        report: gets a line the moment a seed diverges.
         known: what diverged before, by the places of the seeds in the rows.
         names: what each seed is called, [seeds]; default "seed N".
     """
@@ -79,11 +80,11 @@ class DivergenceLogger:
     def __init__(
         self,
         training: TrainingSession,
-        tell: Callable[[str], object],
+        report: Callable[[str], object],
         known: Mapping[int, Divergence] | None = None,
         names: Sequence[str] | None = None,
     ):
-        self.training, self.tell, self.names = training, tell, names
+        self.training, self.report, self.names = training, report, names
         self.diverged: dict[int, Divergence] = dict(known or {})
         """By the places of the seeds in the rows."""
         self.new = 0
@@ -96,7 +97,7 @@ class DivergenceLogger:
             self.diverged[seed] = wrong
             self.new += 1
             name = f"seed {row['seed'][seed]}" if self.names is None else self.names[seed]
-            self.tell(f"{name} diverged at env step {wrong.step:,}: {wrong.what}")
+            self.report(f"{name} diverged at env step {wrong.step:,}: {wrong.what}")
 
     def _wrong(self, row: Row) -> dict[int, Divergence]:
         places = np.arange(len(row["seed"]))
@@ -139,5 +140,5 @@ class HistoryLogger:
 
 
 def warn(line: str) -> None:
-    """Tell a Python caller of a seed that diverged."""
+    """Report a seed that diverged to a Python caller."""
     warnings.warn(line, RuntimeWarning, stacklevel=2)

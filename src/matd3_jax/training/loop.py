@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
-from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -18,6 +17,7 @@ from matd3_jax.core.rollout import Episodes, PolicyParams
 from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.core.update import UpdateMetrics
 from matd3_jax.envs.environment import Environment
+from matd3_jax.training.program import Program
 from matd3_jax.training.schedule import Schedule
 from matd3_jax.training.sharding import SeedSharding, stack, unstack
 from matd3_jax.training.state import Metrics, TrainState, initial, prefix
@@ -195,7 +195,7 @@ class TrainLoop:
         return state, episodes
 
     @cached_property
-    def warm_up(self) -> "Program":
+    def warm_up(self) -> Program:
         """Play `warmup_rollouts` rollouts without learning: (state, episodes [seeds, rollouts])."""
         random = self.schedule.warmup == "random"
         return self.program(partial(self.rollout, random=random), self.schedule.warmup_rollouts)
@@ -274,12 +274,12 @@ class TrainLoop:
         mean = jax.tree.map(lambda *m: jnp.nanmean(jnp.concatenate(m, axis=1), axis=1), *metrics)
         return state, Metrics(total, mean)
 
-    def interval(self, iterations: int) -> "Program":
+    def interval(self, iterations: int) -> Program:
         """The program of `iterations` iterations: (state, metrics [seeds, iterations]). The state given in is
         donated."""
         return self.program(self.iteration, iterations)
 
-    def program(self, iteration: Callable, iterations: int) -> "Program":
+    def program(self, iteration: Callable, iterations: int) -> Program:
         """`iteration`(state, hyper) -> (state, output) of the local seeds, repeated `iterations` times in one
         `lax.scan`."""
 
@@ -295,14 +295,3 @@ class TrainLoop:
 
         specs = (self._specs, P("seeds"))
         return Program(jax.jit(self.sharding.sharded(repeat, specs, specs), donate_argnums=0), self.hyper, iterations)
-
-
-class Program(NamedTuple):
-    """Compiled iterations of training: call it with a state, which is donated."""
-
-    jitted: Any
-    hyper: tuple[HyperParams, ...]
-    iterations: int
-
-    def __call__(self, state: TrainState) -> tuple[TrainState, Any]:
-        return self.jitted(state, self.hyper)

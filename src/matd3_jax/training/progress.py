@@ -13,7 +13,8 @@ from matd3_jax.runs.divergence import Divergence, of_seeds
 from matd3_jax.runtime.terminal import say
 from matd3_jax.stats.text import plus_minus
 from matd3_jax.training.clock import compiling
-from matd3_jax.training.session import Row, TrainingSession
+from matd3_jax.training.rows import Row
+from matd3_jax.training.session import TrainingSession
 
 SECONDS_BETWEEN_LINES = 10
 

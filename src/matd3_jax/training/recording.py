@@ -1,6 +1,7 @@
 """A run that leaves a directory: started, resumed from whatever a stop or a kill left, finished."""
 
 import contextlib
+import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -21,8 +22,9 @@ from matd3_jax.runtime.signals import Stop
 from matd3_jax.training import announcement, checkpoint, finish
 from matd3_jax.training.loggers import DivergenceLogger, Logger, TableLogger, TensorBoardLogger, warn
 from matd3_jax.training.progress import ProgressBar
+from matd3_jax.training.rows import Row
 from matd3_jax.training.run import Outcome, run
-from matd3_jax.training.session import Row, TrainingSession
+from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import TrainState
 
 Say = Callable[[str], None]
@@ -43,8 +45,8 @@ class Recorder:
         processes: which train together; the first alone writes and speaks.
         heed_signals: whether SIGINT, SIGTERM and SIGHUP end a run after a checkpoint (of a program of its own), or
             stay with the program that calls.
-        say: gets the lines about a run; None: nothing is said, nor a progress bar shown, but of a seed that diverges a
-            RuntimeWarning tells.
+        say: gets the lines about a run; None: nothing is said, nor a progress bar shown, but of a seed that diverges is
+            reported by a RuntimeWarning.
         loggers: get the rows of the metrics table, too.
     """
 
@@ -97,6 +99,9 @@ class Recorder:
         Raises UserError where there is no run, it has come to its end, or the checkpoint is damaged.
         """
         directory, settings = RunDirectory.open(path)
+        if directory.sweep is not None and directory.summary() is None and not checkpoint.steps(directory.checkpoints):
+            line = shlex.join(["python", "-m", "matd3_jax.sweep", f"resume={directory.sweep}"])
+            raise UserError(f"{path} is trained together with others, by its sweep: resume it with: {line}")
         self.path = path
         if total_steps is not None:
             settings = config.from_dict({**settings.to_dict(), "total_steps": total_steps})
@@ -105,7 +110,7 @@ class Recorder:
             stop = self._stop()
             there = bool(checkpoint.steps(directory.checkpoints)) if self.processes.first else None
             if not self.processes.broadcast(there) and step is None:
-                self.say("no checkpoint yet: this run starts anew")
+                self.say("no checkpoint yet: this run starts again")
                 if self.processes.first:
                     directory.clear()
                 return self._from_the_start(training, directory, stop)
@@ -180,7 +185,7 @@ class Recorder:
             if self.processes.first:
                 self.say(f"{directory.path} has come to its end; its figures and its summary are made")
                 self._notes(training, directory, done)
-                self._finish(training, directory, {}, watch)
+                self._finish(training, directory, done, {}, watch)
             return Recorded(directory, training, Outcome(state, row, None, watch.diverged))
         if self.processes.first:
             for line in announcement.first_lines(training, directory, done):
@@ -200,15 +205,8 @@ class Recorder:
 
     def _notes(self, training: TrainingSession, directory: RunDirectory, done: int) -> None:
         """Take the rows after env step `done` out of the metrics table, and say what it lacks."""
-        table = directory.cut(done)
-        if table.damaged:
-            plural = "s" * (table.damaged > 1)
-            self.say(f"note: {directory.metrics} had {table.damaged} damaged line{plural}, left out now")
-        first, interval = training.trainer.schedule.warmup_steps, training.interval_steps
-        gaps = table.gaps(first, done, interval, training.share.total)
-        if gaps:
-            shown = ", ".join(f"{a:,} and {b:,}" for a, b in gaps[:3]) + (", ..." if len(gaps) > 3 else "")
-            self.say(f"note: {directory.metrics} lacks rows between env steps {shown}")
+        for line in directory.cut(done, training.expected_table(training.config)):
+            self.say(f"note: {line}")
 
     def _to_the_end(
         self,
@@ -245,15 +243,19 @@ class Recorder:
         if self.processes.first:
             if outcome.finished:
                 rates = {} if progress is None else progress.rates()
-                self._finish(training, directory, {"seconds": round(time.monotonic() - begun, 1), **rates}, watch)
+                facts = {"seconds": round(time.monotonic() - begun, 1), **rates}
+                self._finish(training, directory, step, facts, watch)
             else:
                 title, diverged = announcement.title(training), self._by_number(training, watch)
                 finish.draw(directory, training.layout, title, settings.diagnostics.q_bias, diverged)
         return Recorded(directory, training, outcome)
 
-    def _finish(self, training: TrainingSession, directory: RunDirectory, facts: dict, watch: DivergenceLogger) -> None:
-        title, diverged = announcement.title(training), self._by_number(training, watch)
-        found = finish.finish(directory, training.layout, title, training.config.diagnostics.q_bias, facts, diverged)
+    def _finish(
+        self, training: TrainingSession, directory: RunDirectory, done: int, facts: dict, watch: DivergenceLogger
+    ) -> None:
+        diverged, with_q_bias = self._by_number(training, watch), training.config.diagnostics.q_bias
+        title = announcement.title(training)
+        found = finish.finish(directory, training.layout, title, with_q_bias, done, facts, diverged)
         for line in announcement.last_lines(training, directory, found, diverged):
             self.say(line)
 

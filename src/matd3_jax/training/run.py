@@ -8,7 +8,8 @@ from typing import NamedTuple
 from matd3_jax.runs.divergence import Divergence
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.training.loggers import DivergenceLogger, Logger
-from matd3_jax.training.session import Row, TrainingSession
+from matd3_jax.training.rows import Row
+from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import TrainState
 
 SHARE = 20

@@ -14,25 +14,22 @@ from matd3_jax import envs
 from matd3_jax.config import Config
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import HyperParams
-from matd3_jax.core.rollout import Episodes, Evaluation
+from matd3_jax.core.rollout import Evaluation
 from matd3_jax.envs.environment import Environment
 from matd3_jax.envs.wrappers.joint_team import JointTeam
 from matd3_jax.errors import UserError
 from matd3_jax.runs import overestimation
+from matd3_jax.runs.missing import Expected
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
-from matd3_jax.training import memory
+from matd3_jax.training import memory, rows
 from matd3_jax.training.clock import Clock
 from matd3_jax.training.evaluator import Evaluator
-from matd3_jax.training.loop import Program, TrainLoop
+from matd3_jax.training.loop import TrainLoop
+from matd3_jax.training.program import Program
+from matd3_jax.training.rows import Row
 from matd3_jax.training.schedule import Schedule
 from matd3_jax.training.state import Metrics, TrainState, networks_finite
-
-Row = dict[str, np.ndarray]
-"""Columns of the metrics table for one interval: each [seeds]; "step" and "seed" among them."""
-
-LEARNING_COLUMNS = ("critic_loss", "q_value", "actor_loss")
-"""Of each agent; means over the updates of an interval."""
 
 EVALUATION_SPACING = 4
 """Env steps of training, at least, for each env step of an evaluation, by default. Evaluations cost no updates: they
@@ -194,40 +191,20 @@ class TrainingSession:
 
     def row(self, state: TrainState, metrics: Metrics) -> Row:
         """The interval's row of the metrics table for each seed."""
-        seeds = len(self.seeds)
-        rollouts = int(state.rollouts)
-        row: Row = {
-            "step": np.full(seeds, self.trainer.env_steps(rollouts)),
-            "seed": self.seeds,
-            "updates": np.full(seeds, self.trainer.updates(rollouts)),
-        }
-        episodes = Episodes(*(np.asarray(e, np.float64)[:seeds].sum(axis=1) for e in metrics.episodes))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            returns = episodes.episode_return / episodes.count[:, None]
-            length = episodes.length / episodes.count
-        row["episodes"] = episodes.count.astype(int)
-        row["episode_length"] = length
-        for team in dict.fromkeys(self.layout.teams):
-            row[f"return_{team}"] = returns @ self.team_weights(team)
-        for i, agent in enumerate(self.layout.agents):
-            row[f"{agent}_return"] = returns[:, i]
-        losses = metrics.update._asdict() if metrics.update is not None else {}
-        for name in LEARNING_COLUMNS:
-            values = np.asarray(losses[name], np.float64)[:seeds].mean(axis=1) if losses else None
-            for i, agent in enumerate(self.layout.agents):
-                row[f"{agent}_{name}"] = np.full(seeds, np.nan) if values is None else values[:, i]
-        return row
+        step, updates = self.step(state), self.trainer.updates(int(state.rollouts))
+        return rows.of_interval(self.layout, self.seeds, step, updates, metrics, self.team_weights)
 
     @property
     def columns(self) -> list[str]:
         """The names of the metrics table's columns, in their order."""
-        agents = self.layout.agents
-        names = ["step", "seed", "updates", "episodes", "episode_length"]
-        names += [f"return_{team}" for team in dict.fromkeys(self.layout.teams)]
-        names += [f"{agent}_return" for agent in agents]
-        names += [f"{agent}_{name}" for name in LEARNING_COLUMNS for agent in agents]
-        names += self.evaluation_columns(None)
-        return names + (list(overestimation.columns(agents, None, 0)) if self.config.diagnostics.q_bias else [])
+        names = [*rows.columns(self.layout), *self.evaluation_columns(None)]
+        judged = overestimation.columns(self.layout.agents, None, 0) if self.config.diagnostics.q_bias else {}
+        return names + list(judged)
+
+    def expected_table(self, config: Config) -> Expected:
+        """What the metrics table of a member should have."""
+        seeds = range(config.seed, config.seed + config.seeds)
+        return Expected(self.columns, seeds, self.trainer.schedule.warmup_steps, self.interval_steps)
 
     def team_weights(self, team: str) -> np.ndarray:
         """Weights [agents] of the agents' returns in the number reported for a team (`Environment.return_weights`)."""

@@ -14,8 +14,9 @@ from matd3_jax.envs.check import check
 from matd3_jax.envs.environment import Environment
 from matd3_jax.runtime import devices
 from matd3_jax.training.loggers import CallbackLogger, DivergenceLogger, HistoryLogger, Logger, warn
+from matd3_jax.training.rows import Row
 from matd3_jax.training.run import Outcome, run
-from matd3_jax.training.session import Row, TrainingSession
+from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import TrainState
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ def train(
         callback: called with every interval's row (columns [seeds]) as it comes.
         loggers: get the same rows, and are closed at the end (see `training.loggers.Logger`).
 
-    A seed that diverges is told of by a RuntimeWarning, and is in the result's `diverged`.
+    A seed that diverges is reported by a RuntimeWarning, and is in the result's `diverged`.
 
     Raises UserError for settings that are unknown or impossible, and for an environment that breaks the contract
     (`envs.check`).

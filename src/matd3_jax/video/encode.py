@@ -12,7 +12,7 @@ from matd3_jax.errors import UserError
 from matd3_jax.runtime import files
 
 LAST_FRAME_SECONDS = 1.0
-"""How much longer a GIF shows its last frame, before it starts anew."""
+"""How much longer a GIF shows its last frame, before it starts again."""
 SAMPLES = 16
 """Frames from which a GIF's one palette is drawn."""
 FASTEST_GIF = 50

@@ -41,7 +41,7 @@ def scene(env: ParticleTask, states: State) -> Scene:
     else:
         angle = 2 * np.pi * np.arange(len(env.agents)) / len(env.agents) - np.pi / 2
         pos = np.broadcast_to(0.6 * np.stack([np.cos(angle), np.sin(angle)], axis=1), pos.shape)
-        note = f"code to tell: {goals[0]}, key: {int(states.key[0])}"
+        note = f"code to send: {goals[0]}, key: {int(states.key[0])}"
     for i, label in enumerate(_labels(env.agents)):
         message = None if comm is None or not env.speaks[i] else comm[:, i]
         marked = None if states.key is None else goals[0]

@@ -19,7 +19,7 @@ class SimplePush(ParticleTask):
     """An adversary, a good agent, two landmarks, one of them the goal.
 
     Observation of the adversary [8]: own velocity 2, landmarks relative to oneself 4, the good agent likewise 2. Of
-    the good agent [19]: own velocity 2, goal relative to oneself 2, own color 3 (it tells the goal), landmarks
+    the good agent [19]: own velocity 2, goal relative to oneself 2, own color 3 (it shows the goal), landmarks
     relative to oneself 4, colors of the landmarks 6, the adversary relative to oneself 2.
 
     Reward: the good agent gets minus its distance to the goal; the adversary gets that distance minus its own. Same

@@ -107,7 +107,7 @@ class World:
         radius = self.radius + self.landmark_radius[:solid]
         reach = _constant(np.add.outer(self.radius, radius), pos)
         delta = pos[:, None] - other[None]
-        # Squares that are zero, the agent beside itself among them, become 1: no contact, finite slope, and delta is 0.
+        # Squares that are zero, the agent and itself among them, become 1: no contact, finite slope, and delta is 0.
         # Flat, so that XLA on CPU has an inner loop long enough to vectorize.
         square = jnp.sum(delta**2, axis=-1).reshape(-1)
         distance = jnp.sqrt(jnp.where(square > 0, square, 1))

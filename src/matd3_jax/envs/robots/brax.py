@@ -217,5 +217,5 @@ def _partition(robot: str, split: Split, depth: int | None) -> Partition:
 
 
 def _canonical(state: BraxState) -> BraxState:
-    """`state` without weakly typed arrays: with them, the second step would be compiled anew."""
+    """`state` without weakly typed arrays: with them, the second step would be compiled again."""
     return jax.tree.map(lambda x: jax.lax.convert_element_type(x, jnp.asarray(x).dtype), state)
