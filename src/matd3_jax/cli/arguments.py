@@ -2,10 +2,12 @@
 
 import dataclasses
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 
 from matd3_jax import groups
-from matd3_jax.cli.options import WIDTH, Command, flag, option, others
+from matd3_jax.cli.options import WIDTH, Command, flag, number, option, others
+from matd3_jax.errors import UserError
 from matd3_jax.runs.paths import paths
 from matd3_jax.runtime import slurm
 
@@ -75,12 +77,29 @@ class Sweep(OfProcesses):
     settings: tuple[str, ...] = others("a setting, with one value or several")
 
 
+def saved(texts: Sequence[str], key: str) -> int | str | None:
+    """Which of a run's policies: an env step, "best", or None for the last. Raises UserError for anything else."""
+    if len(texts) > 1:
+        raise UserError(f"{key}= is given {len(texts)} times: {', '.join(texts)}")
+    if texts[0] in ("last", "null"):
+        return None
+    if texts[0] == "best":
+        return "best"
+    step = number(texts[0], int)
+    if step is None or step < 0:
+        raise UserError(f"{key}={texts[0]}: must be the env step of a checkpoint, a whole number, or last, or best")
+    return step
+
+
 @dataclasses.dataclass(frozen=True)
 class OfOneRun:
     """Options of commands that play with the policies of one run."""
 
     run: Path = option("the run directory", metavar="RUN_DIR")
-    checkpoint: int | None = option("the checkpoint of this env step", default=None, least=0, otherwise="the last")
+    checkpoint: int | str | None = option(
+        "the checkpoint of this env step; best: each seed's best evaluation", default=None, metavar="STEP|best",
+        otherwise="the last", read=saved,
+    )  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,9 +154,10 @@ class CrossPlay:
     episodes: int = option("whole episodes of each pair of seeds", default=100, least=1, most=10**6)
     deterministic: bool = option("true: no noise at all; false: sampled, as in training", default=False)
     seed: int = option("of the start states, as in `evaluate`", default=0, least=0, most=LARGEST_SEED)
-    checkpoint: int | None = option(
-        "the checkpoint of this env step, of all runs", default=None, least=0, otherwise="the last of each"
-    )
+    checkpoint: int | str | None = option(
+        "the checkpoint of this env step, of all runs; best: each seed's best evaluation", default=None,
+        metavar="STEP|best", otherwise="the last of each", read=saved,
+    )  # fmt: skip
     out: Path | None = option(
         "a directory that is not there yet, or empty", default=None, otherwise="crossplay/ENV-TIME"
     )

@@ -24,6 +24,7 @@ from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.runtime.terminal import say
 from matd3_jax.sweep import batching
+from matd3_jax.training import best as best_evaluations
 from matd3_jax.training import checkpoint, finish
 from matd3_jax.training import run as training_run
 from matd3_jax.training.loggers import DivergenceLogger, Logger, TableLogger, TensorBoardLogger
@@ -227,7 +228,8 @@ class Batch:
         def save(state: TrainState, step: int) -> None:
             for run in self.runs if self.processes.first else ():
                 run.sync()
-            checkpoint.save(self.checkpoints, step, training.trainer, state, keep=1, share=training.share)
+            own = {"share": training.share, "best": training.best}
+            checkpoint.save(self.checkpoints, step, training.trainer, state, keep=1, **own)
 
         outcome = training_run.run(training, state, row, loggers, save, stop, save_first=fresh)
         if outcome.stopped is not None:
@@ -254,6 +256,7 @@ class Batch:
             return state, row, True
         saved = Path(broadcast(str(checkpoint.verify(self.checkpoints)) if first else None))
         state, done = checkpoint.restore(saved, self.training.trainer, self.training.share), int(saved.name)
+        self.training.best.restore(saved, self.training.share)
         self.processes.barrier()
         for run, config, own in zip(self.runs, self.members, self.seeds, strict=True) if first else ():
             run.cut(done)
@@ -267,9 +270,10 @@ class Batch:
     def _finish(self, state: TrainState, row: Row, facts: Mapping[str, Any]) -> None:
         """Leave each run as if it had been trained alone, but for its replay."""
         trainer, share = self.training.trainer, self.training.share
-        facts = {**facts, "side_by_side": share.total}
+        facts, best = {**facts, "side_by_side": share.total}, self.training.best
         for run, config, seeds in zip(self.runs, self.members, self.seeds, strict=True):
-            checkpoint.save(run.checkpoints, int(row["step"][0]), trainer, state, keep=1, seeds=seeds, share=share)
+            step, own = int(row["step"][0]), {"seeds": seeds, "share": share, "best": best}
+            saved = checkpoint.save(run.checkpoints, step, trainer, state, keep=1, **own)
             if not self.processes.first:
                 continue
             diverged = {
@@ -277,7 +281,9 @@ class Batch:
                 for place, found in self.watch.diverged.items()
                 if seeds.start <= place < seeds.stop
             }
-            finish.finish(run, self.training.layout, str(config.name), config.diagnostics.q_bias, facts, diverged)
+            own_facts = {**facts, **best_evaluations.summary(saved, range(config.seed, config.seed + config.seeds))}
+            title, q_bias = str(config.name), config.diagnostics.q_bias
+            finish.finish(run, self.training.layout, title, q_bias, own_facts, diverged)
 
     def _announce(self) -> None:
         training, config = self.training, self.members[0]

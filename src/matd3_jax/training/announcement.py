@@ -13,6 +13,9 @@ from matd3_jax.training.session import TrainingSession
 ENGINES = {"c": "C MuJoCo", "mjx": "MuJoCo in JAX", "mjx_fast": "MuJoCo in JAX with brax's approximate settings"}
 """What a robot's `physics` may be."""
 
+SHOWN = 8
+"""Seeds, at most, whose best evaluations are told of."""
+
 
 def first_lines(training: TrainingSession, run: RunDirectory, done: int = 0) -> list[str]:
     """Say what is going to be trained from env step `done` on, with what, and how long it may take."""
@@ -56,6 +59,10 @@ def last_lines(
         for name, final in found.get("last_evaluation", {}).items():
             if name not in of_agents:
                 lines.append(f"  {name}: {summary.text(final, over)}")
+    best = found.get("best_evaluation", {})
+    if 0 < len(best) <= SHOWN:
+        shown = (f"seed {seed}: {one['mean_return']:.4g} at env step {one['step']:,}" for seed, one in best.items())
+        lines.append(f"best evaluation of each seed (checkpoint=best plays it): {', '.join(shown)}")
     if settings.diagnostics.q_bias:
         agents, rollouts = training.layout.agents, settings.diagnostics.q_bias_rollouts
         lines += overestimation.lines(divergence.without(run.read_metrics(), diverged), agents, rollouts)

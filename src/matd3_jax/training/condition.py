@@ -10,8 +10,11 @@ from matd3_jax.runs import lock
 from matd3_jax.runs.directory import FORMAT, RunDirectory
 from matd3_jax.runs.metrics_table import MetricsTable
 from matd3_jax.runtime import files
-from matd3_jax.training import checkpoint
+from matd3_jax.training import best, checkpoint
 from matd3_jax.training.session import TrainingSession
+
+SHOWN = 4
+"""Best evaluations of seeds, at most."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,6 +63,7 @@ class Condition:
             f"{settings.seed + settings.seeds - 1}, {settings.total_steps:,} env steps each",
             f"format: {run.format} (this version writes {FORMAT})",
             f"checkpoints: {', '.join(steps) or 'none'}",
+            *self._best(),
             f"metrics: {rows}",
             f"summary: {'there' if self.finished else 'none: the run has not come to its end'}",
             f"lock: {state}",
@@ -69,6 +73,16 @@ class Condition:
         if partial:
             lines.append(f"left by a write that was cut short, removed by the next resume: {', '.join(partial)}")
         return lines
+
+    def _best(self) -> list[str]:
+        """The best evaluations that the last whole checkpoint has."""
+        if not self.whole:
+            return []
+        seeds = range(self.settings.seed, self.settings.seed + self.settings.seeds)
+        found = best.facts(self.run.checkpoints / str(self.whole[-1]), seeds)
+        shown = [f"seed {seed} {one}" for seed, one in found.items()]
+        more = [f"and {len(shown) - SHOWN} more"] if len(shown) > SHOWN else []
+        return [f"best evaluations: {', '.join([*shown[:SHOWN], *more])}"] if found else []
 
 
 def of_run(path: Path) -> Condition:

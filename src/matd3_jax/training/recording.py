@@ -18,7 +18,7 @@ from matd3_jax.runs.divergence import Divergence
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
-from matd3_jax.training import announcement, checkpoint, finish
+from matd3_jax.training import announcement, best, checkpoint, finish
 from matd3_jax.training.loggers import DivergenceLogger, Logger, TableLogger, TensorBoardLogger, warn
 from matd3_jax.training.progress import ProgressBar
 from matd3_jax.training.run import Outcome, run
@@ -176,6 +176,7 @@ class Recorder:
                     "total_steps="
                 )
             state = checkpoint.restore(saved, training.trainer, training.share)
+            training.best.restore(saved, training.share)
             watch = self._watch(training, self._diverged(training, directory, state, done))
             if self.processes.first:
                 self.say(f"{directory.path} has come to its end; its figures and its summary are made")
@@ -187,6 +188,7 @@ class Recorder:
                 self.say(line)
             self.say(f"resumed from the checkpoint of env step {done:,}")
         state = checkpoint.restore(saved, training.trainer, training.share)
+        training.best.restore(saved, training.share)
         self.processes.barrier()  # the files are changed only when all have what they need
         if self.processes.first:
             checkpoint.set_aside_after(directory.checkpoints, done)
@@ -237,7 +239,8 @@ class Recorder:
             keep = settings.keep_checkpoints
             if self.processes.first:
                 directory.sync()
-            checkpoint.save(directory.checkpoints, step, training.trainer, state, keep, share=training.share)
+            own = {"share": training.share, "best": training.best}
+            checkpoint.save(directory.checkpoints, step, training.trainer, state, keep, **own)
 
         outcome = run(training, state, row, loggers, save, stop, save_first=fresh)
         step = int(outcome.row["step"][0])
@@ -253,6 +256,9 @@ class Recorder:
 
     def _finish(self, training: TrainingSession, directory: RunDirectory, facts: dict, watch: DivergenceLogger) -> None:
         title, diverged = announcement.title(training), self._by_number(training, watch)
+        last = directory.checkpoints / str(checkpoint.steps(directory.checkpoints)[-1])
+        numbers = range(training.config.seed, training.config.seed + training.config.seeds)
+        facts = {**facts, **best.summary(last, numbers)}
         found = finish.finish(directory, training.layout, title, training.config.diagnostics.q_bias, facts, diverged)
         for line in announcement.last_lines(training, directory, found, diverged):
             self.say(line)

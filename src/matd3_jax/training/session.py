@@ -22,6 +22,7 @@ from matd3_jax.runs import overestimation
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.training import memory
+from matd3_jax.training.best import BestPolicies
 from matd3_jax.training.clock import Clock
 from matd3_jax.training.evaluator import Evaluator
 from matd3_jax.training.loop import Program, TrainLoop
@@ -110,6 +111,9 @@ class TrainingSession:
         kept = config.diagnostics.q_bias_rollouts if config.diagnostics.q_bias else 0
         self.trainer = TrainLoop(self.env, self.layout, schedule, hyper, seeds, local, q_bias_pairs=kept, **options)
         self.evaluator = Evaluator(self.trainer)
+        judged = "agents" if "agents" in self.layout.teams else self.layout.teams[0]
+        self.best = BestPolicies(seeds, self.team_weights(judged))
+        """Of this process's seeds, by the return of the team "agents"."""
         self.networks_finite = np.ones(self.share.total, bool)
         """[seeds of all processes, in the first of them] whether each seed's networks were finite in the last row."""
 
@@ -289,6 +293,7 @@ class TrainingSession:
             returns, length, measures = (np.full((len(self.seeds), size), np.nan) for size in sizes)
         else:
             found = self.evaluate(state, self.config.eval_episodes, deterministic=True)
+            self.best.note(self.step(state), state, found.episode_return)
             returns, length, measures = (leaf.mean(axis=1).reshape(len(self.seeds), -1) for leaf in found)
         columns = {
             f"eval_return_{team}": returns @ self.team_weights(team) for team in dict.fromkeys(self.layout.teams)
