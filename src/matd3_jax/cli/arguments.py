@@ -196,6 +196,29 @@ class Plot:
 
 
 @dataclasses.dataclass(frozen=True)
+class Export(OfOneRun):
+    """Write each agent's deterministic policy of one seed to files that other programs read.
+
+    Normalization of observations, squashing to the range of actions, and argmax or probabilities of choices are in the
+    files; policies.json beside them says what every entry means. Before they get their names they are read back and
+    compared with JAX on 1,000 observations, to 1e-5.
+    """
+
+    format: str = option(
+        "onnx: a model for each agent; numpy: an .npz, and a reader that needs NumPy alone; saved_fn: functions that "
+        "JAX saved (StableHLO), of any network",
+        choices=("onnx", "numpy", "saved_fn"),
+    )  # fmt: skip
+    seed: int | None = option("which of the run's seeds", default=None, least=0, otherwise="the first")
+    which: str | None = option(
+        "the same as checkpoint=, by name", default=None, choices=("last", "best"), otherwise="last"
+    )
+    out: Path | None = option(
+        "a directory that is not there yet, or empty", default=None, otherwise="RUN_DIR/export/seed_N-STEP-FORMAT"
+    )
+
+
+@dataclasses.dataclass(frozen=True)
 class Check:
     """Say what a run directory holds, what of it is damaged, and how to go on with it. Changes nothing.
 
@@ -266,6 +289,14 @@ PLOT = Command(
     _python("plot"), Plot,
     examples=("python -m matd3_jax.plot runs='runs/sweep/runs/*' y=return_agents,eval_return_agents average=iqm",),
 )  # fmt: skip
+EXPORT = Command(
+    _python("export"), Export,
+    more="format=onnx needs the extra: pip install 'matd3_jax[export]'.",
+    examples=(
+        "python -m matd3_jax.export run=runs/first format=onnx which=best",
+        "python -m matd3_jax.export run=runs/first format=numpy seed=2 out=policies",
+    ),
+)  # fmt: skip
 CHECK = Command(
     _python("check"), Check, usage=("run=RUN_DIR", "sweep=SWEEP_DIR"),
     examples=("python -m matd3_jax.check run=runs/first", "python -m matd3_jax.check sweep=runs/sweep"),
@@ -278,5 +309,6 @@ COMMANDS: dict[str, Command] = {
     "crossplay": CROSSPLAY,
     "plot": PLOT,
     "render": RENDER,
+    "export": EXPORT,
     "check": CHECK,
 }
