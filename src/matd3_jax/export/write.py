@@ -57,8 +57,10 @@ def export(training: TrainingSession, saved: SavedPolicies, seed: int, format: s
     check_new_directory(out, "out")
     policy = training.trainer.policy(saved.state, average=True)
     one = jax.device_get(jax.tree.map(lambda leaf: leaf[place], policy))
-    which = "best evaluation" if saved.best else "checkpoint"
+    best = saved.evaluations[place] if saved.evaluations is not None else None
+    which = "checkpoint" if best is None else "best evaluation"
     facts = {"format": format, **describe.facts(training, seed, int(saved.steps[place]), which)}
+    facts["best_evaluation"] = None if best is None else best.facts
     partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)

@@ -119,8 +119,8 @@ def summary(checkpoint: Path, seeds: Sequence[int]) -> dict[str, dict[str, dict[
     return {"best_evaluation": {str(seed): best.facts for seed, best in found.items()}} if found else {}
 
 
-def played(checkpoint: Path, state: TrainState, seeds: int) -> tuple[TrainState, np.ndarray]:
-    """A state with the policies of the best evaluations in place of a checkpoint's own, and their env steps [seeds].
+def played(checkpoint: Path, state: TrainState, seeds: int) -> tuple[TrainState, list[Best | None]]:
+    """A state with the policies of the best evaluations in place of a checkpoint's own, and these of each seed.
 
     Critics, targets and optimizers are left out; a seed that had no finite evaluation has actors of nan.
 
@@ -151,8 +151,7 @@ def played(checkpoint: Path, state: TrainState, seeds: int) -> tuple[TrainState,
         old if old.critic is None else one  # a team that does not learn stays as it is
         for old, one in zip(state.groups, part.groups, strict=True)
     )
-    steps = np.array([0 if best is None else best.step for best in found])
-    return state._replace(groups=groups, statistics=part.statistics), steps
+    return state._replace(groups=groups, statistics=part.statistics), found
 
 
 def _policies(state: TrainState) -> TrainState:

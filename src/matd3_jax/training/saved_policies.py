@@ -8,6 +8,7 @@ from matd3_jax.runs import divergence
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runs.divergence import Divergence
 from matd3_jax.training import best, checkpoint
+from matd3_jax.training.best import Best
 from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import TrainState
 
@@ -26,7 +27,13 @@ class SavedPolicies(NamedTuple):
     """[seeds] whether the seed's networks have finite numbers only."""
     diverged: dict[int, Divergence]
     """Seeds that had diverged by then, by their numbers."""
-    best: bool
+    evaluations: tuple[Best | None, ...] | None = None
+    """[seeds] the best evaluations that they are of; None: they are a checkpoint's own."""
+
+    @property
+    def best(self) -> bool:
+        """Whether they are those of the best evaluations."""
+        return self.evaluations is not None
 
     @property
     def when(self) -> str:
@@ -45,9 +52,10 @@ def load(run: RunDirectory, training: TrainingSession, which: int | str | None) 
     """
     path = checkpoint.verify(run.checkpoints, which if isinstance(which, int) else None)
     state, seeds = checkpoint.restore_actors(path, training.trainer), training.config.seeds
-    steps = np.full(seeds, int(path.name))
+    steps, evaluations = np.full(seeds, int(path.name)), None
     if which == BEST:
-        state, steps = best.played(path, state, seeds)
+        state, found = best.played(path, state, seeds)
+        steps, evaluations = np.array([0 if one is None else one.step for one in found]), tuple(found)
     numbers = range(training.config.seed, training.config.seed + seeds)
     finite = training.finite(state)
     by_seed = dict(zip(numbers, steps.tolist(), strict=True))
@@ -57,4 +65,4 @@ def load(run: RunDirectory, training: TrainingSession, which: int | str | None) 
         if not sound
     }
     table = {seed: one for seed, one in divergence.of_run(run, max(steps)).items() if one.step <= by_seed[seed]}
-    return SavedPolicies(state, steps, finite, divergence.earliest(table, networks), which == BEST)
+    return SavedPolicies(state, steps, finite, divergence.earliest(table, networks), evaluations)
