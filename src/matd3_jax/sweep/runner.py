@@ -25,7 +25,7 @@ from matd3_jax.runtime.signals import Stop
 from matd3_jax.runtime.terminal import say
 from matd3_jax.sweep import batching
 from matd3_jax.training import best as best_evaluations
-from matd3_jax.training import checkpoint, finish
+from matd3_jax.training import checkpoint, finish, starting
 from matd3_jax.training import run as training_run
 from matd3_jax.training.loggers import DivergenceLogger, Logger, TableLogger, TensorBoardLogger
 from matd3_jax.training.memory import most_seeds, needed
@@ -118,8 +118,11 @@ class Sweep:
         existing = batching.existing_runs(self.runs)
         new = batching.batches(settings, existing, self.runs, lambda config: size * fitting_seeds(config, budget))
         machine = {"versions": devices.versions(), **devices.description()}
-        for config in (config for batch in new for config in batch):
-            RunDirectory.create(self.runs / str(config.name), config, machine)
+        runs = [config for batch in new for config in batch]
+        given = [starting.gather(TrainingSession(config)) if starting.needed(config) else {} for config in runs]
+        for config, leaves in zip(runs, given, strict=True):
+            more = (lambda folder, leaves=leaves: starting.write(folder, leaves)) if leaves else None
+            RunDirectory.create(self.runs / str(config.name), config, machine, more=more)
         if new:
             whole = [*self.batches, *([str(config.name) for config in batch] for batch in new)]
             files.write_json(self._plan, whole)
@@ -249,7 +252,8 @@ class Batch:
         if not broadcast(bool(checkpoint.steps(self.checkpoints)) if first else None):
             for run in self.runs if first else ():
                 run.clear()
-            state, row = self.training.start()
+            given = [starting.of_directory(run.path) for run in self.runs]
+            state, row = self.training.start(starting.joined(given))
             if first:
                 self.table.log(row)
                 self.watch.log(row)

@@ -10,7 +10,7 @@ from matd3_jax.runs import lock
 from matd3_jax.runs.directory import FORMAT, RunDirectory
 from matd3_jax.runs.metrics_table import MetricsTable
 from matd3_jax.runtime import files
-from matd3_jax.training import best, checkpoint
+from matd3_jax.training import best, checkpoint, starting
 from matd3_jax.training.session import TrainingSession
 
 SHOWN = 4
@@ -101,6 +101,11 @@ def of_run(path: Path) -> Condition:
         problems.append(f"{run.path / 'summary.json'} is not whole: a resume makes it anew")
     if not _readable(run.path / "machine.json"):
         problems.append(f"{run.path / 'machine.json'} is missing or not whole: versions and devices are lost")
+    if starting.needed(settings) and not whole:
+        try:
+            starting.read(run.path)
+        except UserError as error:
+            problems.append(str(error))
     for link in (run.metrics, run.checkpoints, run.tensorboard):
         if link.is_symlink():
             problems.append(f"{link} is a link: a resume writes nothing through it")

@@ -18,7 +18,7 @@ from matd3_jax.runs.divergence import Divergence
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
-from matd3_jax.training import announcement, best, checkpoint, finish
+from matd3_jax.training import announcement, best, checkpoint, finish, starting
 from matd3_jax.training.loggers import DivergenceLogger, Logger, TableLogger, TensorBoardLogger, warn
 from matd3_jax.training.progress import ProgressBar
 from matd3_jax.training.run import Outcome, run
@@ -71,13 +71,15 @@ class Recorder:
         Raises UserError where the run is impossible, before anything is written.
         """
         training = self._checked(settings, env)
+        given = starting.gather(training)
         if self.processes.first:
             RunDirectory.check_new(path, or_another)
         self.processes.barrier()  # nothing is written before all processes have found that they can train
         stop = self._stop()
         machine = {"versions": devices.versions(), **self.processes.description()}
+        more = (lambda folder: starting.write(folder, given)) if given else None
         if self.processes.first:
-            path = RunDirectory.create(path, settings, machine, or_another).path
+            path = RunDirectory.create(path, settings, machine, or_another, more).path
         directory = RunDirectory(self.processes.same_directory(path))
         self.path = directory.path
         with self._held(directory):
@@ -138,7 +140,7 @@ class Recorder:
     def _from_the_start(self, training: TrainingSession, directory: RunDirectory, stop: Stop | None) -> Recorded:
         for line in announcement.first_lines(training, directory) if self.processes.first else ():
             self.say(line)
-        state, row = training.start()
+        state, row = training.start(starting.of_directory(directory.path))
         if self.processes.first:
             directory.append(row)
             for logger in self.loggers:

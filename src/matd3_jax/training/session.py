@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -14,6 +14,7 @@ from matd3_jax import envs
 from matd3_jax.config import Config
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import HyperParams
+from matd3_jax.core.q_bias import Values
 from matd3_jax.core.rollout import Episodes, Evaluation
 from matd3_jax.envs.environment import Environment
 from matd3_jax.envs.wrappers.joint_team import JointTeam
@@ -21,7 +22,7 @@ from matd3_jax.errors import UserError
 from matd3_jax.runs import overestimation
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
-from matd3_jax.training import memory
+from matd3_jax.training import memory, starting
 from matd3_jax.training.best import BestPolicies
 from matd3_jax.training.clock import Clock
 from matd3_jax.training.evaluator import Evaluator
@@ -33,7 +34,7 @@ Row = dict[str, np.ndarray]
 """Columns of the metrics table for one interval: each [seeds]; "step" and "seed" among them."""
 
 LEARNING_COLUMNS = ("critic_loss", "q_value", "actor_loss")
-"""Of each agent; means over the updates of an interval."""
+"""Of each agent that learns; means over the updates of an interval."""
 
 EVALUATION_SPACING = 4
 """Env steps of training, at least, for each env step of an evaluation, by default. Evaluations cost no updates: they
@@ -94,6 +95,7 @@ class TrainingSession:
         local = jax.local_devices()
         least = config.normalize_least_deviation
         options: dict[str, Any] = {"normalize_observations": normalize, "least_deviation": least}
+        options["earlier_statistics"] = config.init is not None
         trainer = TrainLoop(self.env, self.layout, schedule, hyper, seeds, local, **options)
         # Whole intervals of equal length, so that one compiled program does for all; as many as come closest to
         # log_every.
@@ -111,9 +113,10 @@ class TrainingSession:
         kept = config.diagnostics.q_bias_rollouts if config.diagnostics.q_bias else 0
         self.trainer = TrainLoop(self.env, self.layout, schedule, hyper, seeds, local, q_bias_pairs=kept, **options)
         self.evaluator = Evaluator(self.trainer)
-        judged = "agents" if "agents" in self.layout.teams else self.layout.teams[0]
+        learning = [self.layout.teams[i] for i in self.layout.learners]
+        judged = "agents" if "agents" in learning else learning[0]
         self.best = BestPolicies(seeds, self.team_weights(judged))
-        """Of this process's seeds, by the return of the team "agents"."""
+        """Of this process's seeds, by the return of the team "agents" (frozen: of the adversaries)."""
         self.networks_finite = np.ones(self.share.total, bool)
         """[seeds of all processes, in the first of them] whether each seed's networks were finite in the last row."""
 
@@ -153,10 +156,18 @@ class TrainingSession:
         """One key a seed; a seed's key does not depend on the other seeds."""
         return jax.vmap(jax.random.key)(self.seeds)
 
-    def start(self) -> tuple[TrainState, Row]:
-        """The state after the warm-up, and what the untrained policies got there (of all processes in the first)."""
+    def start(self, given: Mapping[str, np.ndarray] | None = None) -> tuple[TrainState, Row]:
+        """The state after the warm-up, and what the untrained policies got there (of all processes in the first).
+
+        Args:
+            given: what the seeds of all processes begin with from other runs, as `starting.gather` gives it; None:
+                it is read there, where the settings want any.
+        """
         self.check_memory()
-        state, episodes = self.trainer.warm_up(self.trainer.init(self.keys()))
+        if given is None:
+            given = starting.gather(self)
+        state = starting.put(self.trainer, self.trainer.init(self.keys()), given, self.share)
+        state, episodes = self.trainer.warm_up(state)
         row = self.row(state, Metrics(episodes, None))  # type: ignore[arg-type]
         state, columns = self._evaluated(state, due=True)
         return state, self._gathered(state, row | columns)
@@ -218,8 +229,8 @@ class TrainingSession:
         losses = metrics.update._asdict() if metrics.update is not None else {}
         for name in LEARNING_COLUMNS:
             values = np.asarray(losses[name], np.float64)[:seeds].mean(axis=1) if losses else None
-            for i, agent in enumerate(self.layout.agents):
-                row[f"{agent}_{name}"] = np.full(seeds, np.nan) if values is None else values[:, i]
+            for i in self.layout.learners:
+                row[f"{self.layout.agents[i]}_{name}"] = np.full(seeds, np.nan) if values is None else values[:, i]
         return row
 
     @property
@@ -229,9 +240,10 @@ class TrainingSession:
         names = ["step", "seed", "updates", "episodes", "episode_length"]
         names += [f"return_{team}" for team in dict.fromkeys(self.layout.teams)]
         names += [f"{agent}_return" for agent in agents]
-        names += [f"{agent}_{name}" for name in LEARNING_COLUMNS for agent in agents]
+        learning = self.layout.learning_agents
+        names += [f"{agent}_{name}" for name in LEARNING_COLUMNS for agent in learning]
         names += self.evaluation_columns(None)
-        return names + (list(overestimation.columns(agents, None, 0)) if self.config.diagnostics.q_bias else [])
+        return names + (list(overestimation.columns(learning, None, 0)) if self.config.diagnostics.q_bias else [])
 
     def team_weights(self, team: str) -> np.ndarray:
         """Weights [agents] of the agents' returns in the number reported for a team (`Environment.return_weights`)."""
@@ -313,4 +325,6 @@ class TrainingSession:
         if due and int(state.rollouts) > int(state.reservoir.since):
             found = self.evaluator.measure_q_bias(state, self.config.diagnostics.q_bias_steps)
             state = self.evaluator.restart_reservoir(state)
-        return state, overestimation.columns(self.layout.agents, found, len(self.seeds))
+        if found is not None:
+            found = Values(*(leaf[..., np.array(self.layout.learners)] for leaf in found))
+        return state, overestimation.columns(self.layout.learning_agents, found, len(self.seeds))
