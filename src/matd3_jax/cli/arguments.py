@@ -2,10 +2,12 @@
 
 import dataclasses
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 
 from matd3_jax import groups
-from matd3_jax.cli.options import WIDTH, Command, flag, option, others
+from matd3_jax.cli.options import WIDTH, Command, flag, number, option, others
+from matd3_jax.errors import UserError
 from matd3_jax.runs.paths import paths
 from matd3_jax.runtime import slurm
 
@@ -75,12 +77,29 @@ class Sweep(OfProcesses):
     settings: tuple[str, ...] = others("a setting, with one value or several")
 
 
+def saved(texts: Sequence[str], key: str) -> int | str | None:
+    """Which of a run's policies: an env step, "best", or None for the last. Raises UserError for anything else."""
+    if len(texts) > 1:
+        raise UserError(f"{key}= is given {len(texts)} times: {', '.join(texts)}")
+    if texts[0] in ("last", "null"):
+        return None
+    if texts[0] == "best":
+        return "best"
+    step = number(texts[0], int)
+    if step is None or step < 0:
+        raise UserError(f"{key}={texts[0]}: must be the env step of a checkpoint, a whole number, or last, or best")
+    return step
+
+
 @dataclasses.dataclass(frozen=True)
 class OfOneRun:
     """Options of commands that play with the policies of one run."""
 
     run: Path = option("the run directory", metavar="RUN_DIR")
-    checkpoint: int | None = option("the checkpoint of this env step", default=None, least=0, otherwise="the last")
+    checkpoint: int | str | None = option(
+        "the checkpoint of this env step; best: each seed's best evaluation", default=None, metavar="STEP|best",
+        otherwise="the last", read=saved,
+    )  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,9 +154,10 @@ class CrossPlay:
     episodes: int = option("whole episodes of each pair of seeds", default=100, least=1, most=10**6)
     deterministic: bool = option("true: no noise at all; false: sampled, as in training", default=False)
     seed: int = option("of the start states, as in `evaluate`", default=0, least=0, most=LARGEST_SEED)
-    checkpoint: int | None = option(
-        "the checkpoint of this env step, of all runs", default=None, least=0, otherwise="the last of each"
-    )
+    checkpoint: int | str | None = option(
+        "the checkpoint of this env step, of all runs; best: each seed's best evaluation", default=None,
+        metavar="STEP|best", otherwise="the last of each", read=saved,
+    )  # fmt: skip
     out: Path | None = option(
         "a directory that is not there yet, or empty", default=None, otherwise="crossplay/ENV-TIME"
     )
@@ -173,6 +193,29 @@ class Plot:
     )  # fmt: skip
     title: str | None = option("over the figure", default=None, otherwise="what all runs have in common")
     each: bool = option("true: every seed, too, thin", default=False)
+
+
+@dataclasses.dataclass(frozen=True)
+class Export(OfOneRun):
+    """Write each agent's deterministic policy of one seed to files that other programs read.
+
+    Normalization of observations, squashing to the range of actions, and argmax or probabilities of choices are in the
+    files; policies.json beside them says what every entry means. Before they get their names they are read back and
+    compared with JAX on 1,000 observations, to 1e-5.
+    """
+
+    format: str = option(
+        "onnx: a model for each agent; numpy: an .npz, and a reader that needs NumPy alone; saved_fn: functions that "
+        "JAX saved (StableHLO), of any network",
+        choices=("onnx", "numpy", "saved_fn"),
+    )  # fmt: skip
+    seed: int | None = option("which of the run's seeds", default=None, least=0, otherwise="the first")
+    which: str | None = option(
+        "the same as checkpoint=, by name", default=None, choices=("last", "best"), otherwise="last"
+    )
+    out: Path | None = option(
+        "a directory that is not there yet, or empty", default=None, otherwise="RUN_DIR/export/seed_N-STEP-FORMAT"
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -246,6 +289,14 @@ PLOT = Command(
     _python("plot"), Plot,
     examples=("python -m matd3_jax.plot runs='runs/sweep/runs/*' y=return_agents,eval_return_agents average=iqm",),
 )  # fmt: skip
+EXPORT = Command(
+    _python("export"), Export,
+    more="format=onnx needs the extra: pip install 'matd3_jax[export]'.",
+    examples=(
+        "python -m matd3_jax.export run=runs/first format=onnx which=best",
+        "python -m matd3_jax.export run=runs/first format=numpy seed=2 out=policies",
+    ),
+)  # fmt: skip
 CHECK = Command(
     _python("check"), Check, usage=("run=RUN_DIR", "sweep=SWEEP_DIR"),
     examples=("python -m matd3_jax.check run=runs/first", "python -m matd3_jax.check sweep=runs/sweep"),
@@ -258,5 +309,6 @@ COMMANDS: dict[str, Command] = {
     "crossplay": CROSSPLAY,
     "plot": PLOT,
     "render": RENDER,
+    "export": EXPORT,
     "check": CHECK,
 }

@@ -106,7 +106,8 @@ def _write(out: Path, pairings: Pairings, entered: Sequence[Entrant], options: C
     playing = {
         e.name: {
             "path": str(e.path),
-            "checkpoint": e.step,
+            "checkpoint": "best" if options.checkpoint == "best" else e.steps[0],
+            "steps": e.steps,
             "algorithms": {team: algo.name for team, algo in e.settings.teams().items()},
             "seeds": [e.settings.seed + k for k in range(e.settings.seeds)],
             "diverged": {str(seed): found.step for seed, found in e.diverged.items()},

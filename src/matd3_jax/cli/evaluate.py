@@ -13,7 +13,7 @@ from matd3_jax.runtime import devices, files
 from matd3_jax.runtime.terminal import show
 from matd3_jax.stats.intervals import mean_interval
 from matd3_jax.stats.text import plus_minus
-from matd3_jax.training import checkpoint, memory
+from matd3_jax.training import memory, saved_policies
 from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import TrainState
 
@@ -26,14 +26,11 @@ def main(argv: Sequence[str]) -> int:
     training = TrainingSession(settings)
     seeds_played = training.trainer.sharding.padded_seeds * training.trainer.sharding.devices_per_seed
     memory.check_playing(training.env, training.layout, options.episodes, seeds_played, devices.free_memory())
-    path = checkpoint.verify(run.checkpoints, options.checkpoint)
-    state = checkpoint.restore_actors(path, training.trainer)
-    step, numbers = int(path.name), np.arange(settings.seed, settings.seed + settings.seeds)
-    diverged = divergence.of_networks(training.finite(state), numbers, step)
-    diverged = divergence.earliest(divergence.of_run(run, step), diverged)
+    saved = saved_policies.load(run, training, options.checkpoint)
+    state, diverged, numbers = saved.state, saved.diverged, np.arange(settings.seed, settings.seed + settings.seeds)
     sound = ~np.isin(numbers, list(diverged))
     whose = f", of {divergence.of_seeds(settings.seeds, diverged)}" if diverged else ""
-    table = Table(title=f"{run.path}, env step {step:,}: means of {options.episodes} episodes a seed{whose}")
+    table = Table(title=f"{run.path}, {saved.when}: means of {options.episodes} episodes a seed{whose}")
     seeds = (f"seed {seed}" + (" (diverged)" if seed in diverged else "") for seed in numbers)
     for heading in ("policy", "quantity", *seeds, "mean ± 95 %"):
         table.add_column(heading, justify="left" if heading in ("policy", "quantity") else "right")

@@ -13,6 +13,7 @@ COMMANDS = {
     "crossplay": "play every run's agents against every run's adversaries",
     "plot": "draw learning curves of runs",
     "render": "make a film of an episode",
+    "export": "write policies for other programs: ONNX, NumPy, JAX",
     "check": "say what a run directory holds and what is damaged",
 }
 

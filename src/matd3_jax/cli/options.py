@@ -225,7 +225,7 @@ def _convert(name: str, text: str, kind: Any, meta: typing.Mapping[str, Any], wh
         if text.lower() not in ("true", "false"):
             raise UserError(f"{shown}: must be true or false")
         return text.lower() == "true"
-    value = _number(text, kind)
+    value = number(text, kind)
     if value is None or not bounds.admits(value):
         unit = f" ({meta['unit']})" if meta["unit"] else ""
         noun = NOUNS[kind] if text == whole else f"a list, each {NOUNS[kind]}"
@@ -233,7 +233,7 @@ def _convert(name: str, text: str, kind: Any, meta: typing.Mapping[str, Any], wh
     return value
 
 
-def _number(text: str, kind: type) -> Any:
+def number(text: str, kind: type) -> Any:
     """The number that a text is; None if it is none."""
     try:
         return kind(text)

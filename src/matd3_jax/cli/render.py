@@ -11,7 +11,7 @@ from matd3_jax.evaluation import trajectory
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.terminal import say
-from matd3_jax.training import checkpoint, memory
+from matd3_jax.training import memory, saved_policies
 from matd3_jax.training.session import TrainingSession
 from matd3_jax.video import encode, frames
 
@@ -36,19 +36,18 @@ def main(argv: Sequence[str]) -> int:
     kept = memory.Part(steps * memory.playing_bytes(training.env, training.layout), "its env steps", "max_steps", steps)
     memory.check([kept], devices.free_memory())
     drawing = frames.drawing_of(training.env)
-    saved = checkpoint.verify(run.checkpoints, options.checkpoint)
-    state = checkpoint.restore_actors(saved, training.trainer)
-    finite = training.finite(state)
-    if not finite[seed - settings.seed]:
+    saved = saved_policies.load(run, training, options.checkpoint)
+    state, finite, place = saved.state, saved.finite, seed - settings.seed
+    if not finite[place]:
         others = ", ".join(str(settings.seed + i) for i in np.flatnonzero(finite))
         raise UserError(
-            f"seed={seed} of {run.path} diverged: its networks are not finite at env step {int(saved.name):,}"
+            f"seed={seed} of {run.path} diverged: its networks are not finite at env step {saved.steps[place]:,}"
             + (f"; they are with seed={others}" if others else ", and so with all others; try an earlier checkpoint=")
         )
     played = trajectory.play(
         training,
         state,
-        seed - settings.seed,
+        place,
         options.episode,
         options.deterministic,
         options.max_steps,

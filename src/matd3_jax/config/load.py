@@ -1,6 +1,7 @@
 """Reading settings: YAML files and overrides in Hydra's grammar into a checked `Config`, and back into YAML."""
 
 import copy
+import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,8 +15,8 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from matd3_jax.config.coerce import typed
-from matd3_jax.config.schema import ADDED_LATER, RENAMED, TEXTS, AlgoConfig, Config, DiagnosticsConfig
+from matd3_jax.config.coerce import plain, typed
+from matd3_jax.config.schema import ADDED_LATER, OF_FROZEN, RENAMED, TEXTS, AlgoConfig, Config, DiagnosticsConfig
 from matd3_jax.config.validate import check
 from matd3_jax.errors import OptionError, UserError, nearest
 from matd3_jax.groups import GROUPS, known_names
@@ -34,7 +35,7 @@ def load(overrides: Sequence[str] = (), known: Sequence[str] = ()) -> Config:
     """The configuration that overrides in Hydra's grammar (`env=simple_tag`, `algo.lr=0.003`) give.
 
     Robots take their settings from a recipe (`ROBOT_RECIPE` unless one is given), all others have the paper's.
-    `TEXTS` (name= and out=) are taken as they are typed.
+    `TEXTS` (name=, out= and what names other runs) are taken as they are typed.
 
     Args:
         known: keys that the caller takes itself, for what an error message says about an unknown one.
@@ -55,10 +56,10 @@ def load(overrides: Sequence[str] = (), known: Sequence[str] = ()) -> Config:
     lines = [f"{o.key_or_group}={o.value()}" for o in chosen if o.key_or_group in ("env", "algo")]
     recipe = [o.value() for o in chosen if o.key_or_group == "recipe"]
     adversary = [o.value() for o in chosen if o.key_or_group == "adversary"]
-    if not adversary and any(o.key_or_group.startswith("adversary.") for o in values):
+    if not adversary and any(o.key_or_group.startswith("adversary.") for o in parsed):
         # The same algorithm with other values: start from all that algo= and algo.* say.
         adversary = [o.value() for o in chosen if o.key_or_group == "algo"] or ["matd3"]
-        values = [_renamed(o) for o in values if o.key_or_group.startswith("algo.")] + values
+        values = [_renamed(o) for o in values if _is_of_learning_team(o)] + values
     if adversary:
         lines.append(f"+algo@adversary={adversary[-1]}")
     try:
@@ -81,8 +82,41 @@ def load(overrides: Sequence[str] = (), known: Sequence[str] = ()) -> Config:
     resolved["env"] = _with_engine(resolved["env"])
     for key in ("robot", "per_algorithm"):  # what only serves the files
         resolved.pop(key, None)
-    resolved.update((o.key_or_group, _writable(o)) for o in parsed if _is_text(o))
-    return from_dict(resolved)  # type: ignore[arg-type]
+    for override in (o for o in parsed if _is_text(o)):
+        *group, name = override.key_or_group.split(".")
+        (resolved[group[0]] if group else resolved)[name] = _writable(override)
+    return from_dict(_with_frozen_teams(resolved, parsed))  # type: ignore[arg-type]
+
+
+def _is_of_learning_team(override: Override) -> bool:
+    """Whether an override of algo.* holds for adversaries without an algorithm of their own, too."""
+    group, _, name = override.key_or_group.partition(".")
+    return group == "algo" and name not in OF_FROZEN
+
+
+def _with_frozen_teams(resolved: Mapping[Any, Any], parsed: Sequence[Override]) -> dict[Any, Any]:
+    """Settings in which frozen teams have those of the runs that their policies are of.
+
+    Raises UserError where there is no such run, or such a team is given settings of its own.
+    """
+    found = dict(resolved)
+    for group, team in {"algo": "agents", "adversary": "adversaries"}.items():
+        own = found.get(group)
+        if not own or own.get("frozen") is not True or not own.get("policy"):
+            continue
+        for override in parsed:
+            key, _, name = override.key_or_group.partition(".")
+            if key == group and (name not in OF_FROZEN if name else group == "adversary"):
+                raise UserError(
+                    f"{_line(override)}: a frozen team has the settings of {group}.policy={own['policy']}; leave it out"
+                )
+        path = Path(own["policy"])
+        if not (path / "config.yaml").is_file():
+            what = "it has no config.yaml" if path.is_dir() else "there is no such directory"
+            raise UserError(f"{group}.policy={path} is no run directory: {what}")
+        source = read(path).teams()[team]
+        found[group] = {**plain(dataclasses.asdict(source)), **{name: own[name] for name in OF_FROZEN}}
+    return found
 
 
 def parse(overrides: Sequence[str], sweep: bool = False) -> list[Override]:

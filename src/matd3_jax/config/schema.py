@@ -88,6 +88,10 @@ class AlgoConfig:
     critic_head: str = setting(SHAPES, choices=("scalar", "categorical"), before="scalar")
     critic_atoms: int = setting(SHAPES, least=2, before=51)
     critic_range: tuple[float, float] | None = setting(SHAPES, before=None)
+    frozen: bool = setting(SHAPES, before=False)
+    policy: str | None = setting(SHAPES, before=None, text=True)
+    policy_checkpoint: str | None = setting(SHAPES, before=None, text=True)
+    policy_seed: int | None = setting(SHAPES, before=None, least=0)
 
     def algorithm(self) -> Algorithm:
         """What fixes the shape of the learner."""
@@ -138,6 +142,9 @@ class Config:
     replay_capacity: int = setting(SHAPES, least=1)
     learning_starts: int = setting(SHAPES, least=1)
     warmup: str = setting(SHAPES, choices=("policy", "random"))
+    init: str | None = setting(SHAPES, before=None, text=True)
+    init_checkpoint: str | None = setting(SHAPES, before=None, text=True)
+    init_seed: int | None = setting(SHAPES, before=None, least=0)
     name: str | None = setting(BOOKKEEPING, text=True)
     out: str = setting(BOOKKEEPING, text=True)
     log_every: int | None = setting(BOOKKEEPING, splits=True, least=1)
@@ -175,8 +182,14 @@ def _before(cls: type) -> dict[str, Any]:
 HYPER_PARAMS = keys(AlgoConfig, LEARNING)
 """Settings of an algorithm that may differ between runs of one program."""
 
-TEXTS = keys(Config, text=True)
+TEXTS = (
+    *keys(Config, text=True),
+    *(f"{team}.{name}" for team in ("algo", "adversary") for name in keys(AlgoConfig, text=True)),
+)
 """Settings that are taken as they are typed."""
+
+OF_FROZEN = ("frozen", "policy", "policy_checkpoint", "policy_seed")
+"""Settings of a team that does not learn; its others are those of the run that its policy is of."""
 
 RECORDS = keys(Config, BOOKKEEPING)
 """Settings that say how long a run goes and what it leaves behind; they do not change how it learns."""

@@ -29,6 +29,7 @@ def check(config: "Config") -> None:
         not (diagnostics.q_bias and config.eval_every == 0),
         "diagnostics.q_bias=true measures at evaluations, and eval_every=0 means none: give eval_every=, in env steps",
     )
+    _check_start(config, need)
     for name, team in {"algo": config.algo, "adversary": config.adversary}.items():
         if team is not None:
             _check_team(name, team, config.updates_per_collect, need)
@@ -59,10 +60,46 @@ def check(config: "Config") -> None:
     )
 
 
+def _check_start(config: "Config", need: Any) -> None:
+    """What a run takes of others."""
+    need(
+        config.init is not None or (config.init_checkpoint is None and config.init_seed is None),
+        "init_checkpoint= and init_seed= go with init=RUN_DIR",
+    )
+    need(config.init != "", "init=: must name a run directory")
+    _check_checkpoint("init_checkpoint", config.init_checkpoint, need)
+    for name, team in {"algo": config.algo, "adversary": config.adversary}.items():
+        if team is None:
+            continue
+        _check_checkpoint(f"{name}.policy_checkpoint", team.policy_checkpoint, need)
+        need(
+            not team.frozen or bool(team.policy),
+            f"{name}.frozen=true: say whose policy the team plays, with {name}.policy=RUN_DIR",
+        )
+        need(
+            team.frozen or team.policy is None,
+            f"{name}.policy={team.policy} goes with {name}.frozen=true (to train on from a run's networks: init=)",
+        )
+        need(
+            team.frozen or (team.policy_checkpoint is None and team.policy_seed is None),
+            f"{name}.policy_checkpoint= and {name}.policy_seed= go with {name}.frozen=true",
+        )
+    teams = config.teams()
+    need(
+        not all(team.frozen for team in teams.values()),
+        "algo.frozen=true: nobody would learn; give the adversaries an algorithm: adversary=NAME",
+    )
+
+
+def _check_checkpoint(key: str, text: str | None, need: Any) -> None:
+    good = text is None or text in ("last", "best") or (text.isascii() and text.isdigit() and len(text) < 20)
+    need(good, f"{key}={text}: must be the env step of a checkpoint, a whole number, or last, or best")
+
+
 def _check_team(name: str, team: "AlgoConfig", updates: int, need: Any) -> None:
     _check_bounds(f"{name}.", team)
     need(
-        updates % team.policy_delay == 0 or team.policy_delay % updates == 0,
+        team.frozen or updates % team.policy_delay == 0 or team.policy_delay % updates == 0,
         f"updates_per_collect={updates} is not a multiple of {name}.policy_delay={team.policy_delay} (nor divides it)",
     )
     if isinstance(team.exploration_noise, tuple):

@@ -42,6 +42,11 @@ class Group:
         return StackedMLP((len(self.members),), (*self.algorithm.hidden, self.action_space.size))
 
     @property
+    def frozen(self) -> bool:
+        """Whether the members play a given policy and do not learn."""
+        return self.algorithm.frozen
+
+    @property
     def critic(self) -> Critic:
         """The critics of one member."""
         return critics.of(self.algorithm)
@@ -82,8 +87,24 @@ class JointLayout:
         return len(self.agents)
 
     def by_team(self) -> dict[str, list[str]]:
-        """Names of the agents of each team."""
-        return {t: [a for a, team in zip(self.agents, self.teams, strict=True) if team == t] for t in self.teams}
+        """Names of the agents that learn, of each team that does."""
+        learning = [self.teams[i] for i in self.learners]
+        return {t: [self.agents[i] for i in self.learners if self.teams[i] == t] for t in learning}
+
+    @property
+    def learning_agents(self) -> tuple[str, ...]:
+        """Names of the agents that learn."""
+        return tuple(self.agents[i] for i in self.learners)
+
+    @cached_property
+    def learners(self) -> tuple[int, ...]:
+        """Numbers of the agents that learn: all but those of frozen teams."""
+        return tuple(i for i, algorithm in enumerate(self.algorithms) if not algorithm.frozen)
+
+    @property
+    def learning_groups(self) -> tuple[Group, ...]:
+        """The groups that learn."""
+        return tuple(group for group in self.groups if not group.frozen)
 
     @property
     def observation_size(self) -> int:

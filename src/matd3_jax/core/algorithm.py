@@ -45,6 +45,8 @@ class Algorithm:
     """The exploration noise of each environment and agent is drawn from a range at the start of every episode."""
     smoothing: bool = False
     """Add clipped Gaussian noise to the targets' actions (target policy smoothing)."""
+    frozen: bool = False
+    """The team plays a given policy, deterministically, and does not learn: it has no critics and no targets."""
     sync_targets: bool = True
     """Targets start as copies of the online networks; False: as independent draws, as in the authors' program."""
 

@@ -39,7 +39,8 @@ def target_actions(
     noise: Noise,
 ) -> chex.Array:
     """a'_j = mu'_j(o'_j) + epsilon, epsilon = clip(N(0, sigma), -c, c) with smoothing, one sample for all critics of an
-    agent: [batch, action size], of all agents for central critics, else of the agent itself."""
+    agent: [batch, action size], of all agents for central critics, else of the agent itself. Of frozen teams what they
+    will do: their policy, without epsilon."""
     central = group.algorithm.critic == "central"
     if central:
         others = [(other, params, other.actors) for other, params in zip(layout.groups, mu_targets, strict=True)]
@@ -47,6 +48,9 @@ def target_actions(
         others = [(group, own_target, group.actor)]
     parts = []
     for j, (other, params, network) in enumerate(others):
+        if other.frozen:
+            parts.append(batch.frozen_next[j])
+            continue
         part = other.policy.sample(apply(network, params, batch.next_observations[j]), noise.target[j])
         draw = noise.smoothing[j]
         if draw is not None:

@@ -35,12 +35,16 @@ class Minibatch(NamedTuple):
     """[batch] r_i; with n_step > 1 the return's sum of discounted rewards."""
     discount: chex.Array
     """[batch] 0 where the episode terminated, else 1; with n_step > 1 times gamma^(m - 1)."""
-    next_observations: tuple[chex.Array, ...]
-    """o' of those whose target actors the target needs, one array [agents, batch, observation size] per group."""
+    next_observations: tuple[chex.Array | None, ...]
+    """o' of those whose target actors the target needs, one array [agents, batch, observation size] per group; None for
+    frozen groups."""
     next_x: chex.Array
     """[batch, critic inputs without actions] x', or o'_i."""
     action_column: chex.Array | int
     """Where a_i stands in `inputs`."""
+    frozen_next: tuple[chex.Array | None, ...] = ()
+    """What frozen groups do in x', [members, batch, action size] each, None for groups that learn; () where none is
+    frozen."""
 
 
 class Noise(NamedTuple):
@@ -61,9 +65,14 @@ def places(layout: JointLayout, group: Group) -> Place:
 
 
 def minibatch(
-    layout: JointLayout, group: Group, rows: chex.Array, place: Place, gamma: chex.Array | float
+    layout: JointLayout,
+    group: Group,
+    rows: chex.Array,
+    place: Place,
+    gamma: chex.Array | float,
+    frozen_next: tuple[chex.Array | None, ...] = (),
 ) -> Minibatch:
-    """The minibatch of one member from its rows [batch, row_size]."""
+    """The minibatch of one member from its rows [batch, row_size]; frozen_next: see there."""
     central = group.algorithm.critic == "central"
     parts = layout.row_parts(rows)
 
@@ -74,7 +83,8 @@ def minibatch(
     action = part(parts.action, place.action, group.action_space.size)
     own_next = part(parts.next_x, place.observation, group.observation_size)
     every_next = tuple(
-        jnp.stack([layout.observation_part(parts.next_x, j) for j in other.members]) for other in layout.groups
+        None if other.frozen else jnp.stack([layout.observation_part(parts.next_x, j) for j in other.members])
+        for other in layout.groups
     )
     return Minibatch(
         observation=observation,
@@ -85,6 +95,7 @@ def minibatch(
         next_observations=every_next if central else (own_next,),
         next_x=parts.next_x if central else own_next,
         action_column=layout.observation_size + place.action if central else group.observation_size,
+        frozen_next=frozen_next if central else (),
     )
 
 
@@ -95,16 +106,17 @@ def draw_noise(layout: JointLayout, group: Group, shape: tuple[int, int], key: c
     size = local * (1 if axis is None else jax.lax.axis_size(axis))
     members = len(group.members)
     action_key, target_key, smooth_key = jax.random.split(key, 3)
-    wanted: list[tuple[Policy, tuple[int, ...]]]
+    wanted: list[tuple[Policy | None, tuple[int, ...]]]
     if group.algorithm.critic == "central":
-        wanted = [(other.policy, (len(other.members), size)) for other in layout.groups]
+        wanted = [(None if other.frozen else other.policy, (len(other.members), size)) for other in layout.groups]
     else:
         wanted, batches = [(group.policy, (size,))], members  # nobody shares an own action
 
     def draws(draw, key):
         drawn = []
         for j, (policy, lead) in enumerate(wanted):
-            one = draw(policy, jax.random.fold_in(key, j), (1 if batches == 1 else members, *lead))
+            shape = (1 if batches == 1 else members, *lead)
+            one = None if policy is None else draw(policy, jax.random.fold_in(key, j), shape)
             # With a shared minibatch all agents look at the same target actions.
             drawn.append(None if one is None else jnp.broadcast_to(one, (members, *one.shape[1:])))
         return tuple(drawn)

@@ -84,12 +84,17 @@ def measure(
 def estimate(
     layout: JointLayout, policy: PolicyParams, critics: Sequence[chex.ArrayTree], inputs: chex.Array
 ) -> chex.Array:
-    """Q_i(x, a) of every agent, mean over its critics, in the units of its rewards: [pairs, num_agents]."""
+    """Q_i(x, a) of every agent, mean over its critics, in the units of its rewards: [pairs, num_agents]; nan for those
+    of frozen teams."""
     x, action = jnp.split(inputs, [layout.observation_size], axis=-1)
     if policy.statistics is not None:
         x = running_statistics.normalize(policy.statistics, x)
     values: list[Any] = [None] * layout.num_agents
     for group, params in zip(layout.groups, critics, strict=True):
+        if group.frozen:
+            for i in group.members:
+                values[i] = jnp.full(inputs.shape[:-1], jnp.nan)
+            continue
         for k, i in enumerate(group.members):
             parts = [x, action]
             if group.algorithm.critic == "own":
@@ -115,7 +120,9 @@ def play_out(
     gamma = jnp.stack([jnp.asarray(policy.hyper[layout.place(i)[0]].gamma) for i in range(layout.num_agents)])
     # All noise in one draw for each group, not one for each step; None for a Box.
     noise = tuple(
-        group.policy.own_noise(jax.random.fold_in(noise_key, g), (steps, len(group.members), number))
+        None
+        if group.frozen
+        else group.policy.own_noise(jax.random.fold_in(noise_key, g), (steps, len(group.members), number))
         for g, group in enumerate(layout.groups)
     )
 

@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from matd3_jax.core import networks, running_statistics
+from matd3_jax.core import frozen, networks, running_statistics
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import HyperParams
+from matd3_jax.core.frozen import Scale
 from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.envs.environment import Environment
 
@@ -27,6 +28,8 @@ class PolicyParams(NamedTuple):
     """One per group."""
     statistics: Statistics | None
     """What observations are normalized by; None: they are not."""
+    scales: tuple[Scale | None, ...] = ()
+    """One per group: what frozen groups normalize by, None for others; () where no group is frozen."""
 
 
 class EnvState(NamedTuple):
@@ -73,7 +76,7 @@ def start(env: Environment, key: chex.PRNGKey, num_envs: int, noise_range: bool 
 
 def ranged(layout: JointLayout) -> bool:
     """Whether an agent's exploration noise is drawn from a range."""
-    return any(algorithm.noise_range for algorithm in layout.algorithms)
+    return any(algorithm.noise_range and not algorithm.frozen for algorithm in layout.algorithms)
 
 
 def collect(
@@ -93,7 +96,8 @@ def collect(
     where an episode ended), what ended on the way, and the state of the environment before each row's action, leading
     axis [length * num_envs] (None unless `keep_states`).
 
-    random: act uniformly at random instead: warm-up without the policies. unroll: steps that one iteration holds.
+    random: act uniformly at random instead, but for frozen teams: warm-up without the policies. unroll: steps that one
+    iteration holds.
     """
     num_envs = env_state.episode_step.shape[0]
     noise_key, step_key, reset_key = jax.random.split(key, 3)
@@ -104,7 +108,7 @@ def collect(
         draws, step_keys, fresh, fresh_quantile = inputs
         before = carry.state if keep_states else None
         quantile = 0.5 if carry.noise_quantile is None else carry.noise_quantile
-        action = layout.join_actions(draws) if random else act(layout, policy, carry.observation, draws, quantile)
+        action = act(layout, policy, carry.observation, draws, quantile, random)
         after = jax.vmap(env.step)(step_keys, carry.state, env_actions(layout, action))
         x, next_x = (jnp.concatenate(o, axis=-1) for o in (carry.observation, after.observation))
         rows = layout.pack_rows(x, action, after.reward, next_x, after.terminated, after.truncated)
@@ -204,28 +208,40 @@ def act(
     observation: Sequence[chex.Array],
     draws: Sequence[chex.Array | None] | None,
     noise_quantile: chex.Array | float = 0.5,
+    random: bool = False,
 ) -> chex.Array:
     """Joint actions [envs, action_size] for one observation [envs, size] per agent.
 
     Args:
         draws: noise [members, envs, action size] per group (see `Policy.noise`); None, for one group or all:
-            deterministic actions.
+            deterministic actions. Frozen groups have none.
         noise_quantile: [envs, num_agents] where in its range the exploration noise of an agent that has one is;
             outside of collecting the middle.
+        random: the draws are whole actions.
     """
-    parts, statistics = [], policy.statistics
+    parts, statistics, raw = [], policy.statistics, observation
     if statistics is not None:
         observation = [running_statistics.normalize_part(layout, statistics, o, i) for i, o in enumerate(observation)]
     for g, group in enumerate(layout.groups):
+        if group.frozen:
+            seen = jnp.stack([raw[i] for i in group.members])
+            scale = policy.scales[g]
+            assert scale is not None
+            parts.append(group.policy.mode(frozen.outputs(group, policy.actors[g], scale, seen)))
+            continue
+        if random:
+            assert draws is not None and draws[g] is not None
+            parts.append(draws[g])
+            continue
         stacked = jnp.stack([observation[i] for i in group.members])
         output = networks.apply(group.actors, policy.actors[g], stacked)
         draw = None if draws is None else draws[g]
-        scale = policy.hyper[g].exploration_noise
+        sigma = policy.hyper[g].exploration_noise
         if group.algorithm.noise_range:
             quantile = jnp.broadcast_to(noise_quantile, (stacked.shape[1], layout.num_agents))
             own = quantile[:, np.array(group.members)].T[..., None]
-            scale = scale + own * (policy.hyper[g].exploration_noise_high - scale)
-        parts.append(group.policy.sample(output, draw, scale))
+            sigma = sigma + own * (policy.hyper[g].exploration_noise_high - sigma)
+        parts.append(group.policy.sample(output, draw, sigma))
     return layout.join_actions(parts)
 
 
@@ -236,10 +252,13 @@ def env_actions(layout: JointLayout, action: chex.Array) -> tuple[chex.Array, ..
 
 def _noise(
     layout: JointLayout, key: chex.PRNGKey, shape: tuple[int, ...], random: bool = False
-) -> tuple[chex.Array, ...]:
-    """Noise [*shape[:-1], members, shape[-1], action size] of every group; `random`: whole random actions instead."""
+) -> tuple[chex.Array | None, ...]:
+    """Noise [*shape[:-1], members, shape[-1], action size] of every group, None of frozen ones; `random`: whole random
+    actions instead."""
     return tuple(
-        (group.policy.random if random else group.policy.noise)(
+        None
+        if group.frozen
+        else (group.policy.random if random else group.policy.noise)(
             jax.random.fold_in(key, g), (*shape[:-1], len(group.members), shape[-1])
         )
         for g, group in enumerate(layout.groups)

@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from matd3_jax.core import losses, minibatch, networks, optimizer
 from matd3_jax.core.agents import Group, JointLayout
 from matd3_jax.core.algorithm import HyperParams
+from matd3_jax.core.frozen import Scale, unscaled
 from matd3_jax.core.minibatch import Minibatch, Noise, Place
 
 UNROLLED_MEMBERS = 4
@@ -29,6 +30,8 @@ class GroupState(NamedTuple):
     critic_optimizer: optax.OptState
     actor_average: chex.ArrayTree | None = None
     """With `Algorithm.actor_average` alone."""
+    scale: Scale | None = None
+    """Of a frozen group, which has an actor besides and nothing else."""
 
 
 class UpdateMetrics(NamedTuple):
@@ -39,7 +42,7 @@ class UpdateMetrics(NamedTuple):
     q_value: chex.Array
     """Mean value that the first critic gives to the replayed joint actions."""
     actor_loss: chex.Array
-    """NaN where this update left the actor alone."""
+    """NaN where this update left the actor alone; of frozen agents all three are NaN."""
 
 
 def critic_input_size(layout: JointLayout, group: Group) -> int:
@@ -49,11 +52,15 @@ def critic_input_size(layout: JointLayout, group: Group) -> int:
 
 
 def init(layout: JointLayout, key: chex.PRNGKey) -> tuple[GroupState, ...]:
-    """Fresh networks and optimizers of all groups."""
+    """Fresh networks and optimizers of all groups; of frozen ones an actor alone, in whose place a given one goes."""
 
     def one(group: Group, key: chex.PRNGKey) -> GroupState:
         algorithm, keys = group.algorithm, jax.random.split(key, 4)
         observation, inputs = jnp.zeros((1, group.observation_size)), critic_input_size(layout, group)
+        if group.frozen:
+            mu, nothing = group.actor.init(keys[0], observation)["params"], (None,) * 6
+            one = jax.tree.map(lambda leaf: leaf[0], unscaled(1, group.observation_size))
+            return GroupState(mu, *nothing, scale=one)  # type: ignore[arg-type]
         mu, q = group.actor.init(keys[0], observation)["params"], group.critic.init(keys[1], inputs)
         if algorithm.sync_targets:
             # Copies, not the same arrays: the state is donated, and one buffer can't be given away twice.
@@ -82,6 +89,7 @@ def update(
     sequential: bool = False,
     one_by_one: bool = False,
     axis: str | None = None,
+    frozen_next: tuple[chex.Array | None, ...] = (),
 ) -> tuple[tuple[GroupState, ...], UpdateMetrics]:
     """One update of every agent's critics, and of actors and targets where `move` says so.
 
@@ -96,19 +104,23 @@ def update(
             one agent's activations stay in a CPU's cache.
         axis: mesh axis whose devices share the work of each minibatch: `rows` are this device's equal part of it (the
             first rows on the first device), gradients are averaged over all. None: one device has the whole.
+        frozen_next: what frozen groups do in x' of the rows (`frozen.next_actions`).
     """
     mu_targets = [group.actor_target for group in state]
     keys = jax.random.split(key, len(layout.groups))
     places = [minibatch.places(layout, group) for group in layout.groups]
     noises = [
-        minibatch.draw_noise(layout, group, rows.shape[:2], k, axis)
+        minibatch.draw_noise(layout, group, rows.shape[:2], k, axis) if not group.frozen else None
         for group, k in zip(layout.groups, keys, strict=True)
     ]
     new, metrics = list(state), jnp.full((3, layout.num_agents), jnp.nan)
 
     def cut(g: int, place: Place) -> Minibatch:
-        own = rows[0] if rows.shape[0] == 1 else jax.lax.dynamic_index_in_dim(rows, place.agent, keepdims=False)
-        return minibatch.minibatch(layout, layout.groups[g], own, place, hyper[g].gamma)
+        def own(whole: chex.Array) -> chex.Array:
+            return whole[0] if rows.shape[0] == 1 else jax.lax.dynamic_index_in_dim(whole, place.agent, keepdims=False)
+
+        others = jax.tree.map(own, frozen_next)
+        return minibatch.minibatch(layout, layout.groups[g], own(rows), place, hyper[g].gamma, others)
 
     def minibatches(g: int) -> Place | Minibatch:
         """Of all members, stacked; one by one each is cut out in its turn, as all N together hold N times N parts."""
@@ -132,6 +144,8 @@ def update(
     if sequential:
         for i in range(layout.num_agents):
             g, k = layout.place(i)
+            if layout.groups[g].frozen:
+                continue
             args = jax.tree.map(lambda leaf, k=k: leaf[k], (state[g], mu_targets[g], minibatches(g), noises[g]))
             after, m = member(g, mu_targets)(args)
             new[g] = jax.tree.map(lambda old, one, k=k: old.at[k].set(one), new[g], after)
@@ -139,6 +153,8 @@ def update(
             metrics = metrics.at[:, i].set(jnp.stack(m))
     else:
         for g, group in enumerate(layout.groups):
+            if group.frozen:
+                continue
             args = (state[g], mu_targets[g], minibatches(g), noises[g])
             next_action = None
             if rows.shape[0] == 1 and group.algorithm.critic == "central":

@@ -75,6 +75,26 @@ class Environment(abc.ABC):
         return sum(self.observation_sizes)
 
     @property
+    def observation_names(self) -> tuple[tuple[str, ...], ...] | None:
+        """What each entry of each agent's observation is, with its unit, for people; None: nobody has said."""
+        return None
+
+    @property
+    def full_observation_names(self) -> tuple[str, ...] | None:
+        """The same of `full_observation`."""
+        names = self.observation_names
+        return (
+            None
+            if names is None
+            else tuple(f"{a}: {n}" for a, own in zip(self.agents, names, strict=True) for n in own)
+        )
+
+    @property
+    def action_names(self) -> tuple[tuple[str, ...], ...] | None:
+        """What each entry of each agent's action is (of choices: each option), for people; None: nobody has said."""
+        return None
+
+    @property
     def measures(self) -> tuple[str, ...]:
         """Names of what `measure` gives, units in the docstring of the environment: evaluations report their means."""
         return ()

@@ -67,6 +67,20 @@ class PointReach(Environment):
     def return_weights(self) -> tuple[float, ...]:
         return (1 / self.num_agents,) * self.num_agents
 
+    @property
+    def observation_names(self) -> tuple[tuple[str, ...], ...]:
+        axes, agents = ("x", "y", "z")[: self.dim] if self.dim < 4 else tuple(map(str, range(self.dim))), self.agents
+        parts = [
+            ["own velocity", "target from here", *(f"{other} from here" for other in agents if other != one)]
+            for one in agents
+        ]
+        return tuple(tuple(f"{part} {axis}" for part in own for axis in axes) for own in parts)
+
+    @property
+    def action_names(self) -> tuple[tuple[str, ...], ...]:
+        axes = ("x", "y", "z")[: self.dim] if self.dim < 4 else tuple(map(str, range(self.dim)))
+        return (tuple(f"force {axis}" for axis in axes),) * self.num_agents
+
     def reset(self, key: chex.PRNGKey) -> tuple[PointState, tuple[chex.Array, ...]]:
         positions = jax.random.uniform(key, (self.num_agents + 1, self.dim), minval=-1.0, maxval=1.0)
         pos, target = positions[:-1], positions[-1]

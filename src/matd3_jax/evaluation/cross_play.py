@@ -96,17 +96,20 @@ def team_of(training: TrainingSession, env: Environment, state: TrainState, team
     # Through the host: the seeds may lie on different devices, copies behind the last of them.
     seeds = training.config.seeds
     policy = jax.tree.map(lambda leaf: np.asarray(leaf)[:seeds], training.trainer.policy(state, average=True))
-    actors, hyper = [], []
+    actors: list[Any] = []
+    hyper, scales = [], []
     for group in own.layout.groups:
         found = [whole.place(who[i]) for i in group.members]
         g, rows = found[0][0], [row for _, row in found]
         actors.append(jax.tree.map(lambda leaf, rows=rows: leaf[:, rows], policy.actors[g]))
         hyper.append(policy.hyper[g])
+        scale = policy.scales[g] if policy.scales else None
+        scales.append(jax.tree.map(lambda leaf, rows=rows: leaf[:, rows], scale))
     statistics = policy.statistics
     if statistics is not None:
         parts = [[whole.observation_part(leaf, i) for i in who] for leaf in statistics]
         statistics = Statistics(*(np.concatenate(part, axis=-1) for part in parts))
-    return Team(own, PolicyParams(tuple(actors), tuple(hyper), statistics))
+    return Team(own, PolicyParams(tuple(actors), tuple(hyper), statistics, tuple(scales) if policy.scales else ()))
 
 
 def play(
@@ -170,7 +173,11 @@ def _program(env: Environment, sides: tuple[Side, ...], devices: tuple, episodes
 def _acting(algorithm: Algorithm) -> Algorithm:
     """What acting knows of an algorithm."""
     return Algorithm(
-        "actor", hidden=algorithm.hidden, actor_output=algorithm.actor_output, noise_range=algorithm.noise_range
+        "actor",
+        hidden=algorithm.hidden,
+        actor_output=algorithm.actor_output,
+        noise_range=algorithm.noise_range,
+        frozen=algorithm.frozen,
     )
 
 

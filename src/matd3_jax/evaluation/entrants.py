@@ -18,7 +18,7 @@ from matd3_jax.runs import divergence
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runs.divergence import Divergence
 from matd3_jax.runtime import devices
-from matd3_jax.training import checkpoint, memory
+from matd3_jax.training import checkpoint, memory, saved_policies
 from matd3_jax.training.session import TrainingSession
 
 
@@ -28,8 +28,8 @@ class Entrant(NamedTuple):
     name: str
     path: Path
     settings: Config
-    step: int
-    """Env step of the checkpoint."""
+    steps: list[int]
+    """Env step of each seed's policies."""
     teams: dict[str, Team]
     diverged: dict[int, Divergence]
     """Seeds that do not play, by their numbers."""
@@ -40,12 +40,14 @@ class Entrant(NamedTuple):
         return [k for k in range(self.settings.seeds) if self.settings.seed + k not in self.diverged]
 
 
-def load(where: Sequence[Path], step: int | None, matched: bool, episodes: int) -> tuple[list[Entrant], Environment]:
+def load(
+    where: Sequence[Path], which: int | str | None, matched: bool, episodes: int
+) -> tuple[list[Entrant], Environment]:
     """Load the teams of runs, and the environment that all have in common.
 
     Args:
         where: run directories.
-        step: of the checkpoint, of all runs; None: the last of each.
+        which: env step of the checkpoint, of all runs; None: the last of each; "best" (see `saved_policies.load`).
         matched: whether the first seed of one run is going to play the first of the other, and so on.
         episodes: that each pair is going to play, for the memory.
 
@@ -65,23 +67,21 @@ def load(where: Sequence[Path], step: int | None, matched: bool, episodes: int) 
             )
     if set(env.teams) != set(TEAMS):
         raise UserError(f"{first.env['name']} has no adversaries: there is nobody to play against")
-    found = [checkpoint.verify(run.checkpoints, step) for run, _ in opened]
+    for run, _ in opened:
+        checkpoint.verify(run.checkpoints, which if isinstance(which, int) else None)
     names = [path.resolve().name for path in where]
     if len(set(names)) < len(names):
         names = [str(path) for path in where]
     entrants = []
-    for name, (run, settings), saved in zip(names, opened, found, strict=True):
+    for name, (run, settings) in zip(names, opened, strict=True):
         training = TrainingSession(settings)
         together = cross_play.side_by_side(settings.seeds**2, episodes)
         memory.check_playing(env, training.layout, episodes, together, devices.free_memory())
-        state = checkpoint.restore_actors(saved, training.trainer)
-        teams = {team: cross_play.team_of(training, env, state, team) for team in TEAMS}
-        step, numbers = int(saved.name), range(settings.seed, settings.seed + settings.seeds)
-        diverged = divergence.of_networks(training.finite(state), numbers, step)
-        diverged = divergence.earliest(divergence.of_run(run, step), diverged)
-        entrants.append(Entrant(name, run.path, settings, step, teams, diverged))
+        saved = saved_policies.load(run, training, which)
+        teams = {team: cross_play.team_of(training, env, saved.state, team) for team in TEAMS}
+        entrants.append(Entrant(name, run.path, settings, saved.steps.tolist(), teams, saved.diverged))
         if not entrants[-1].sound:
-            raise UserError(f"{run.path}: all seeds diverged ({divergence.which(diverged)}): nobody can play")
+            raise UserError(f"{run.path}: all seeds diverged ({divergence.which(saved.diverged)}): nobody can play")
     if matched and not set.intersection(*(set(entrant.sound) for entrant in entrants)):
         raise UserError("pairing=matched: each of the pairs has a seed that diverged")
     return entrants, env

@@ -3,13 +3,11 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from matd3_jax.core import rollout
-from matd3_jax.core.agents import JointLayout
 from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import TrainState
 
@@ -98,9 +96,8 @@ def play(
         def step(carry, key):
             state, observation = carry
             act_key, env_key = jax.random.split(key)
-            draws = None if deterministic else _noise(layout, act_key)
-            action = rollout.act(layout, policy, [o[None] for o in observation], draws)
-            actions = tuple(a[0] for a in rollout.env_actions(layout, action))
+            chosen = rollout.decide(layout, policy, [o[None] for o in observation], None if deterministic else act_key)
+            actions = tuple(a[0] for a in chosen)
             after = env.step(jax.random.split(env_key, number + 1)[number], state, actions)
             kept = (keep(after.state), after.reward, after.terminated, after.truncated)
             return (after.state, after.observation), kept
@@ -123,11 +120,4 @@ def play(
         returns={team: so_far @ training.team_weights(team) for team in dict.fromkeys(layout.teams)},
         terminated=bool(terminated[length - 1]),
         truncated=bool(truncated[length - 1]),
-    )
-
-
-def _noise(layout: JointLayout, key: chex.PRNGKey) -> tuple[chex.Array, ...]:
-    """Exploration noise [members, 1, action size] of every group."""
-    return tuple(
-        group.policy.noise(jax.random.fold_in(key, g), (len(group.members), 1)) for g, group in enumerate(layout.groups)
     )

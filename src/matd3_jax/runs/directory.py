@@ -6,7 +6,7 @@ import json
 import os
 import shlex
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,9 @@ from matd3_jax.runtime import files
 FORMAT = 1
 """Of what a run directory holds, in its machine.json; directories without it are of format 0, and are read, too."""
 
+START = "start.npz"
+"""What a run begins with from other runs (`training.starting`)."""
+
 
 PLANS = ("batches", "pieces")
 """What a sweep's file of its batches, and their folder, are called; in older ones the latter."""
@@ -34,7 +37,8 @@ class RunDirectory:
     """Where a run leaves its files.
 
     config.yaml (all resolved settings), machine.json (versions and devices), metrics.csv (one row an interval and
-    seed), checkpoints/, learning_curve.png, summary.json (written at the end), on request q_bias.png and tensorboard/.
+    seed), checkpoints/, learning_curve.png, summary.json (written at the end), on request q_bias.png and tensorboard/,
+    start.npz of a run that begins with networks of others.
     """
 
     def __init__(self, path: Path):
@@ -58,12 +62,20 @@ class RunDirectory:
             raise UserError(_there(path))
 
     @classmethod
-    def create(cls, path: Path, config: Config, machine: Mapping[str, Any], or_another: bool = False) -> "RunDirectory":
+    def create(
+        cls,
+        path: Path,
+        config: Config,
+        machine: Mapping[str, Any],
+        or_another: bool = False,
+        more: Callable[[Path], object] | None = None,
+    ) -> "RunDirectory":
         """Make the directory, which gets its name with its settings in it: a kill leaves none without.
 
         Args:
             or_another: make the first of PATH, PATH-2, PATH-3, ... that is not there yet, even while others do the
                 same.
+            more: writes further files into the directory before it gets its name.
 
         Raises UserError if it is there already or cannot be made.
         """
@@ -73,6 +85,8 @@ class RunDirectory:
             new.mkdir(parents=True)
             configuration.write(config, new / "config.yaml")
             files.write_json(new / "machine.json", {"format": FORMAT, **machine})
+            if more is not None:
+                more(new)
             for number in itertools.count(1):
                 tried = path if number == 1 else path.with_name(f"{path.name}-{number}")
                 if not os.path.lexists(tried):
@@ -136,7 +150,7 @@ class RunDirectory:
         """Whether the directory was made, and nothing has been trained in it."""
         if self.path.is_symlink() or not self.path.is_dir():
             return False
-        own = {"config.yaml", "machine.json", *(left.name for left in files.partial(self.path))}
+        own = {"config.yaml", "machine.json", START, *(left.name for left in files.partial(self.path))}
         return {found.name for found in self.path.iterdir()} <= own
 
     def clean(self) -> None:

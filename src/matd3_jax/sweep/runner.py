@@ -24,7 +24,8 @@ from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.runtime.terminal import say
 from matd3_jax.sweep import batching
-from matd3_jax.training import checkpoint, finish
+from matd3_jax.training import best as best_evaluations
+from matd3_jax.training import checkpoint, finish, starting
 from matd3_jax.training import run as training_run
 from matd3_jax.training.loggers import DivergenceLogger, Logger, TableLogger, TensorBoardLogger
 from matd3_jax.training.memory import most_seeds, needed
@@ -117,8 +118,11 @@ class Sweep:
         existing = batching.existing_runs(self.runs)
         new = batching.batches(settings, existing, self.runs, lambda config: size * fitting_seeds(config, budget))
         machine = {"versions": devices.versions(), **devices.description()}
-        for config in (config for batch in new for config in batch):
-            RunDirectory.create(self.runs / str(config.name), config, machine)
+        runs = [config for batch in new for config in batch]
+        given = [starting.gather(TrainingSession(config)) if starting.needed(config) else {} for config in runs]
+        for config, leaves in zip(runs, given, strict=True):
+            more = (lambda folder, leaves=leaves: starting.write(folder, leaves)) if leaves else None
+            RunDirectory.create(self.runs / str(config.name), config, machine, more=more)
         if new:
             whole = [*self.batches, *([str(config.name) for config in batch] for batch in new)]
             files.write_json(self._plan, whole)
@@ -227,7 +231,8 @@ class Batch:
         def save(state: TrainState, step: int) -> None:
             for run in self.runs if self.processes.first else ():
                 run.sync()
-            checkpoint.save(self.checkpoints, step, training.trainer, state, keep=1, share=training.share)
+            own = {"share": training.share, "best": training.best}
+            checkpoint.save(self.checkpoints, step, training.trainer, state, keep=1, **own)
 
         outcome = training_run.run(training, state, row, loggers, save, stop, save_first=fresh)
         if outcome.stopped is not None:
@@ -247,13 +252,15 @@ class Batch:
         if not broadcast(bool(checkpoint.steps(self.checkpoints)) if first else None):
             for run in self.runs if first else ():
                 run.clear()
-            state, row = self.training.start()
+            given = [starting.of_directory(run.path) for run in self.runs]
+            state, row = self.training.start(starting.joined(given))
             if first:
                 self.table.log(row)
                 self.watch.log(row)
             return state, row, True
         saved = Path(broadcast(str(checkpoint.verify(self.checkpoints)) if first else None))
         state, done = checkpoint.restore(saved, self.training.trainer, self.training.share), int(saved.name)
+        self.training.best.restore(saved, self.training.share)
         self.processes.barrier()
         for run, config, own in zip(self.runs, self.members, self.seeds, strict=True) if first else ():
             for line in run.cut(done, self.training.expected_table(config)):
@@ -268,9 +275,10 @@ class Batch:
     def _finish(self, state: TrainState, row: Row, facts: Mapping[str, Any]) -> None:
         """Leave each run as if it had been trained alone, but for its replay."""
         trainer, share, done = self.training.trainer, self.training.share, int(row["step"][0])
-        facts = {**facts, "side_by_side": share.total}
+        facts, best = {**facts, "side_by_side": share.total}, self.training.best
         for run, config, seeds in zip(self.runs, self.members, self.seeds, strict=True):
-            checkpoint.save(run.checkpoints, done, trainer, state, keep=1, seeds=seeds, share=share)
+            own = {"seeds": seeds, "share": share, "best": best}
+            saved = checkpoint.save(run.checkpoints, done, trainer, state, keep=1, **own)
             if not self.processes.first:
                 continue
             diverged = {
@@ -279,7 +287,8 @@ class Batch:
                 if seeds.start <= place < seeds.stop
             }
             settings = str(config.name), config.diagnostics.q_bias
-            finish.finish(run, self.training.layout, *settings, done, facts, diverged)
+            own_facts = {**facts, **best_evaluations.summary(saved, range(config.seed, config.seed + config.seeds))}
+            finish.finish(run, self.training.layout, *settings, done, own_facts, diverged)
 
     def _announce(self) -> None:
         training, config = self.training, self.members[0]

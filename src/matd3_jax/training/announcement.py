@@ -7,11 +7,14 @@ from matd3_jax.runs import divergence, overestimation, summary
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runs.divergence import Divergence
 from matd3_jax.runtime import devices
-from matd3_jax.training import cost
+from matd3_jax.training import cost, starting
 from matd3_jax.training.session import TrainingSession
 
 ENGINES = {"c": "C MuJoCo", "mjx": "MuJoCo in JAX", "mjx_fast": "MuJoCo in JAX with brax's approximate settings"}
 """What a robot's `physics` may be."""
+
+SHOWN = 8
+"""Seeds, at most, whose best evaluations are told of."""
 
 
 def first_lines(training: TrainingSession, run: RunDirectory, done: int = 0) -> list[str]:
@@ -26,6 +29,7 @@ def first_lines(training: TrainingSession, run: RunDirectory, done: int = 0) -> 
         f"{title(training)}, seeds {settings.seed} to {settings.seed + settings.seeds - 1}, "
         f"{training.total_steps:,} env steps each, on {trainer.mesh.size} x {kinds}{several}",
         *_robot_lines(training),
+        *starting.lines(settings),
         f"schedule: {settings.num_envs} x {settings.rollout_length} env steps, then {settings.updates_per_collect} "
         f"updates with {settings.batch_size} transitions",
         training.memory,
@@ -59,8 +63,12 @@ def last_lines(
         for name, final in found.get("last_evaluation", {}).items():
             if name not in of_agents:
                 lines.append(f"  {name}: {summary.text(final, over)}")
+    best = found.get("best_evaluation", {})
+    if 0 < len(best) <= SHOWN:
+        shown = (f"seed {seed}: {one['mean_return']:.4g} at env step {one['step']:,}" for seed, one in best.items())
+        lines.append(f"best evaluation of each seed (checkpoint=best plays it): {', '.join(shown)}")
     if settings.diagnostics.q_bias:
-        agents, rollouts = training.layout.agents, settings.diagnostics.q_bias_rollouts
+        agents, rollouts = training.layout.learning_agents, settings.diagnostics.q_bias_rollouts
         lines += overestimation.lines(divergence.without(run.read_metrics(), diverged), agents, rollouts)
         lines.append(f"estimated and true values: {run.q_bias}")
     return [*lines, f"learning curve: {run.curve}"]
@@ -68,8 +76,8 @@ def last_lines(
 
 def title(training: TrainingSession) -> str:
     """The environment and the algorithms of a run in a few words."""
-    teams = dict.fromkeys(training.layout.teams)
-    names = [f"{training.config.teams()[team].name}" for team in teams]
+    teams = {team: training.config.teams()[team] for team in training.layout.teams}
+    names = [f"{'frozen ' * algo.frozen}{algo.name}" for algo in teams.values()]
     return f"{training.config.env['name']}: " + " against ".join(dict.fromkeys(names))
 
 

@@ -1,7 +1,8 @@
 """Checkpoints: everything a run carries, written with Orbax, checked by checksum before it is read back.
 
 Layout of one: `STEP/state` (all but the replay; several processes write `STEP/state/FIRST`, each its seeds, from number
-FIRST on), `STEP/replay/SEED` (the rows filled so far; none in what a sweep leaves of its runs), `STEP/checksums.json`.
+FIRST on), `STEP/replay/SEED` (the rows filled so far; none in what a sweep leaves of its runs), `STEP/best/SEED.npz`
+(see `training.best`), `STEP/checksums.json`.
 A checkpoint appears under its name only when it is whole. The replay is written and read one seed at a time, so that it
 never stands in memory twice. What some processes wrote any other number of them can read.
 """
@@ -27,6 +28,7 @@ from matd3_jax.core import replay
 from matd3_jax.errors import UserError
 from matd3_jax.runtime import files
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Share
+from matd3_jax.training.best import BestPolicies
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.state import TrainState
 
@@ -48,6 +50,7 @@ def save(
     keep: int,
     seeds: slice | None = None,
     share: Share | None = None,
+    best: BestPolicies | None = None,
 ) -> Path:
     """Write the checkpoint of env step `step` and delete all but the newest `keep`.
 
@@ -55,6 +58,7 @@ def save(
         seeds: write these seeds' part alone, without their replay: enough to evaluate them, not to resume. None: all.
         share: which seeds the trainer has. Every process writes its own, the first makes a checkpoint of it. None:
             there are no others.
+        best: the policies of the trainer's seeds to be kept with it.
     """
     share = share or SINGLE_PROCESS.share(trainer.num_seeds)
     processes, wanted = share.processes, seeds or slice(0, share.total)
@@ -81,6 +85,8 @@ def save(
             written.append(partial_ / "replay" / str(share.first + seed))
             checkpointer.save(there / written[-1].relative_to(partial_), {"rows": rows})
             checkpointer.wait_until_finished()
+    if best is not None:
+        written += best.write(partial_, {k - share.first: k - wanted.start for k in range(first, last)})
     parts = processes.gather_messages(json.dumps(_checksums(partial_, written)).encode())
     if processes.first:
         checksums = dict(sorted(pair for part in parts for pair in json.loads(part).items()))
@@ -289,9 +295,9 @@ def _rebuild(trainer: TrainLoop, path: Path, share: Share) -> TrainState:
     return jax.device_put(state, trainer.shardings)
 
 
-def _checksums(path: Path, folders: Sequence[Path]) -> dict[str, str]:
-    """Digests of all files in `folders`, by their names from `path` on."""
-    found = (file for folder in folders for file in folder.rglob("*") if file.is_file())
+def _checksums(path: Path, places: Sequence[Path]) -> dict[str, str]:
+    """Digests of files, and of all files in folders, by their names from `path` on."""
+    found = (file for place in places for file in (place, *place.rglob("*")) if file.is_file())
     return {str(file.relative_to(path)): _digest(file, sync=True) for file in found}
 
 

@@ -11,8 +11,11 @@ from matd3_jax.runs.directory import FORMAT, RunDirectory
 from matd3_jax.runs.metrics_table import MetricsTable
 from matd3_jax.runs.missing import Expected
 from matd3_jax.runtime import files
-from matd3_jax.training import checkpoint
+from matd3_jax.training import best, checkpoint, starting
 from matd3_jax.training.session import TrainingSession
+
+SHOWN = 4
+"""Best evaluations of seeds, at most."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,6 +64,7 @@ class Condition:
             f"{settings.seed + settings.seeds - 1}, {settings.total_steps:,} env steps each",
             f"format: {run.format} (this version writes {FORMAT})",
             f"checkpoints: {', '.join(steps) or 'none'}",
+            *self._best(),
             f"metrics: {rows}",
             f"summary: {'there' if self.finished else 'none: the run has not come to its end'}",
             f"lock: {state}",
@@ -70,6 +74,16 @@ class Condition:
         if partial:
             lines.append(f"left by a write that was cut short, removed by the next resume: {', '.join(partial)}")
         return lines
+
+    def _best(self) -> list[str]:
+        """The best evaluations that the last whole checkpoint has."""
+        if not self.whole:
+            return []
+        seeds = range(self.settings.seed, self.settings.seed + self.settings.seeds)
+        found = best.facts(self.run.checkpoints / str(self.whole[-1]), seeds)
+        shown = [f"seed {seed} {one}" for seed, one in found.items()]
+        more = [f"and {len(shown) - SHOWN} more"] if len(shown) > SHOWN else []
+        return [f"best evaluations: {', '.join([*shown[:SHOWN], *more])}"] if found else []
 
 
 def of_run(path: Path) -> Condition:
@@ -87,6 +101,11 @@ def of_run(path: Path) -> Condition:
         problems.append(f"{run.path / 'summary.json'} is not whole: a resume makes it again")
     if not _readable(run.path / "machine.json"):
         problems.append(f"{run.path / 'machine.json'} is missing or not whole: versions and devices are lost")
+    if starting.needed(settings) and not whole:
+        try:
+            starting.read(run.path)
+        except UserError as error:
+            problems.append(str(error))
     for link in (run.metrics, run.checkpoints, run.tensorboard):
         if link.is_symlink():
             problems.append(f"{link} is a link: a resume writes nothing through it")

@@ -37,7 +37,9 @@ def acting_flops(layout: JointLayout) -> float:
 def update_flops(layout: JointLayout, schedule: Schedule) -> float:
     """Floating point operations of the matrix products in one update of one seed, all agents, actors counted as often
     as they move."""
-    return 2.0 * schedule.batch_size * sum(len(g.members) * _member(layout, schedule, g) for g in layout.groups)
+    return (
+        2.0 * schedule.batch_size * sum(len(g.members) * _member(layout, schedule, g) for g in layout.learning_groups)
+    )
 
 
 def step_flops(layout: JointLayout, schedule: Schedule) -> float:
@@ -175,7 +177,7 @@ def expectation(training: TrainingSession, done: int = 0) -> str:
     if training.processes.size > 1 or not trainer.on_cpu:
         where = "several processes" if training.processes.size > 1 else "an accelerator"
         return f"expected: not estimated for {where}; the first interval shows the rate and the time left"
-    group = max(layout.groups, key=lambda g: len(g.members) * _member(layout, schedule, g))
+    group = max(layout.learning_groups, key=lambda g: len(g.members) * _member(layout, schedule, g))
     critic = (update.critic_input_size(layout, group), *group.algorithm.hidden, group.critic.num_outputs)
     layer = max(pairwise(critic), key=lambda sizes: sizes[0] * sizes[1])
     # Larger products are done at the same rate, and take longer to measure.

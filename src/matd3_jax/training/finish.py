@@ -73,6 +73,6 @@ def finish(
     sound = _draw(run, metrics, layout, title, with_q_bias, diverged)
     found = summary.summary(metrics, done, diverged, **facts)
     if with_q_bias and sound["step"].size:
-        found["overestimation"] = overestimation.summary(sound, layout.agents)
+        found["overestimation"] = overestimation.summary(sound, layout.learning_agents)
     run.write_summary(found)
     return found

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
-from matd3_jax.core import minibatch, n_step, q_bias, replay, rollout, running_statistics, update
+from matd3_jax.core import frozen, minibatch, n_step, q_bias, replay, rollout, running_statistics, update
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.q_bias import Pairs
@@ -33,6 +33,7 @@ class TrainLoop:
         normalize_observations: networks see observations in units of their running mean and standard deviation; the
             replay keeps them as they are.
         least_deviation: of what observations are normalized by.
+        earlier_statistics: runs may begin with statistics of another run.
         q_bias_pairs: states and actions that each seed keeps for `Evaluator.measure_q_bias`; 0: none, and no trace of
             it in the programs.
         unroll: how many iterations, and updates after a rollout with many, one pass of their compiled loop holds;
@@ -55,13 +56,15 @@ class TrainLoop:
         unroll: int = 1,
         unroll_steps: int = 1,
         devices_per_seed: int | None = None,
+        earlier_statistics: bool = False,
     ):
+        self.earlier_statistics = earlier_statistics and normalize_observations
         self.env, self.layout, self.schedule, self.num_seeds = env, layout, schedule, num_seeds
         self.unroll, self.unroll_steps = unroll, unroll_steps
         self.normalize_observations, self.q_bias_pairs = normalize_observations, q_bias_pairs
         self.least_deviation = least_deviation
         updates = schedule.updates_per_collect
-        for group in layout.groups:
+        for group in layout.learning_groups:
             delay = group.algorithm.policy_delay
             if updates % delay and delay % updates:
                 raise ValueError(f"updates_per_collect={updates} and policy_delay={delay}: one must divide the other")
@@ -82,7 +85,7 @@ class TrainLoop:
     @cached_property
     def period(self) -> int:
         """Updates after which every group's policy delay has come round."""
-        return math.lcm(*(group.algorithm.policy_delay for group in self.layout.groups))
+        return math.lcm(*(group.algorithm.policy_delay for group in self.layout.learning_groups))
 
     @cached_property
     def rollouts_per_iteration(self) -> int:
@@ -135,6 +138,7 @@ class TrainLoop:
     @cached_property
     def _init(self) -> Callable:
         settings = self.env, self.layout, self.schedule.num_envs, self.normalize_observations, self.q_bias_pairs
+        settings += (self.earlier_statistics,)
         return self.sharding.sharded(partial(initial, *settings), P("seeds"), self._specs)
 
     @cached_property
@@ -145,7 +149,7 @@ class TrainLoop:
 
     @property
     def _specs(self) -> TrainState:
-        return prefix(P("seeds"), P(), self.normalize_observations, self.q_bias_pairs > 0)
+        return prefix(P("seeds"), P(), self.normalize_observations, self.q_bias_pairs > 0, self.earlier_statistics)
 
     def policy(
         self, state: TrainState, hyper: tuple[HyperParams, ...] | None = None, average: bool = False
@@ -159,10 +163,14 @@ class TrainLoop:
         if isinstance(state.groups, list):  # inside a program whose seeds are apart
             each = zip(*([group.actor for group in groups] for groups in state.groups), strict=True)
             actors = tuple(stack(one) for one in each)
+            each_scale = zip(*([group.scale for group in groups] for groups in state.groups), strict=True)
+            scales = tuple(stack(one) for one in each_scale)
         else:
             averaged = [average and group.actor_average is not None for group in state.groups]
             actors = tuple(g.actor_average if a else g.actor for g, a in zip(state.groups, averaged, strict=True))
-        return PolicyParams(actors, self.hyper if hyper is None else hyper, self.scale(state))
+            scales = tuple(g.scale for g in state.groups)
+        scales = scales if any(group.frozen for group in self.layout.groups) else ()
+        return PolicyParams(actors, self.hyper if hyper is None else hyper, self.scale(state), scales)
 
     def scale(self, state: TrainState) -> Statistics | None:
         """What observations are normalized by: running statistics, with the least deviation that is set."""
@@ -188,8 +196,9 @@ class TrainLoop:
             state = state._replace(reservoir=state.reservoir._replace(pairs=pairs))
         if state.statistics is not None:
             x = self.layout.row_parts(rows).x
-            merge = jax.vmap(running_statistics.merge, in_axes=(0, 0, None))
-            state = state._replace(statistics=merge(state.statistics, x, state.rollouts))
+            before = state.rollouts if state.earlier is None else state.rollouts + state.earlier
+            merge = jax.vmap(running_statistics.merge, in_axes=(0, 0, None if state.earlier is None else 0))
+            state = state._replace(statistics=merge(state.statistics, x, before))
         rows = replay.write(state.replay, rows, state.rollouts)
         state = state._replace(env=env, replay=rows, key=keys[:, 1], rollouts=state.rollouts + 1)
         return state, episodes
@@ -214,11 +223,12 @@ class TrainLoop:
             for u in range(unrolled):
                 index_key, update_key = jax.random.split(keys[u])
                 indices = replay.sample_indices(index_key, size, (batches, schedule.batch_size))
-                rows = self.minibatches(state, hyper, seed, minibatch.own_part(indices, axis, dimension=-1))
+                raw = self._drawn(state, hyper, seed, minibatch.own_part(indices, axis, dimension=-1))
+                others = frozen.next_actions(self.layout, states, raw)
+                rows = self._normalized(state, seed, raw)
                 move = [(first + u + 1) % group.algorithm.policy_delay == 0 for group in groups]
-                states, m = update.update(
-                    self.layout, states, hyper, rows, update_key, move, schedule.sequential, self.on_cpu, axis
-                )
+                how = (schedule.sequential, self.on_cpu, axis, others)
+                states, m = update.update(self.layout, states, hyper, rows, update_key, move, *how)
                 metrics.append(m)
             return states, jax.tree.map(lambda *m: jnp.stack(m), *metrics)
 
@@ -251,13 +261,21 @@ class TrainLoop:
     ) -> chex.Array:
         """What updates take: the rows [*indices.shape, row_size] of a local seed and its `hyper`, rewards of n_step
         steps in them, observations normalized."""
+        return self._normalized(state, seed, self._drawn(state, hyper, seed, indices))
+
+    def _drawn(
+        self, state: TrainState, hyper: Sequence[HyperParams], seed: chex.Array | int, indices: chex.Array
+    ) -> chex.Array:
+        """`minibatches` before their observations are normalized."""
         schedule, layout = self.schedule, self.layout
         if layout.n_step == 1:
-            rows = replay.gather(state.replay, seed, indices)
-        else:
-            written = replay.Written(schedule.replay_capacity, schedule.rollout_steps, state.rollouts)
-            gamma = jnp.stack([jnp.asarray(hyper[layout.place(i)[0]].gamma) for i in range(layout.num_agents)])
-            rows = n_step.draw(layout, state.replay, seed, indices, written, schedule.num_envs, gamma)
+            return replay.gather(state.replay, seed, indices)
+        written = replay.Written(schedule.replay_capacity, schedule.rollout_steps, state.rollouts)
+        gamma = jnp.stack([jnp.asarray(hyper[layout.place(i)[0]].gamma) for i in range(layout.num_agents)])
+        return n_step.draw(layout, state.replay, seed, indices, written, schedule.num_envs, gamma)
+
+    def _normalized(self, state: TrainState, seed: chex.Array | int, rows: chex.Array) -> chex.Array:
+        """Replay rows [..., row_size] of a local seed with x and x' as networks see them."""
         scale = self.scale(state)
         if scale is None:
             return rows

@@ -47,7 +47,10 @@ def parts(trainer: TrainLoop, seeds: int, episodes: int = 0) -> dict[str, Part]:
     schedule, state = trainer.schedule, trainer.abstract_state()
     networks = 2 * size(state.groups) // trainer.sharding.padded_seeds
     others = seed_bytes(trainer) - networks
-    capacity, most = schedule.replay_capacity, max(group.algorithm.num_critics for group in trainer.layout.groups)
+    capacity, most = (
+        schedule.replay_capacity,
+        max(group.algorithm.num_critics for group in trainer.layout.learning_groups),
+    )
     many = most > 2
     return {
         "replay": Part(copies * replay, "the replay", "replay_capacity", capacity),
@@ -126,7 +129,7 @@ def update_bytes(trainer: TrainLoop) -> int:
         group.algorithm.num_critics * (sum(group.algorithm.hidden) + group.critic.num_outputs)
         + layout.observation_size
         + layout.action_size
-        for group in layout.groups
+        for group in layout.learning_groups
     )
     rows = layout.num_agents * layout.row_size  # gathered for all agents at once
     noise = layout.num_agents * 3 * layout.action_size

@@ -19,7 +19,7 @@ from matd3_jax.runs.divergence import Divergence
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
-from matd3_jax.training import announcement, checkpoint, finish
+from matd3_jax.training import announcement, best, checkpoint, finish, starting
 from matd3_jax.training.loggers import DivergenceLogger, Logger, TableLogger, TensorBoardLogger, warn
 from matd3_jax.training.progress import ProgressBar
 from matd3_jax.training.rows import Row
@@ -73,13 +73,15 @@ class Recorder:
         Raises UserError where the run is impossible, before anything is written.
         """
         training = self._checked(settings, env)
+        given = starting.gather(training)
         if self.processes.first:
             RunDirectory.check_new(path, or_another)
         self.processes.barrier()  # nothing is written before all processes have found that they can train
         stop = self._stop()
         machine = {"versions": devices.versions(), **self.processes.description()}
+        more = (lambda folder: starting.write(folder, given)) if given else None
         if self.processes.first:
-            path = RunDirectory.create(path, settings, machine, or_another).path
+            path = RunDirectory.create(path, settings, machine, or_another, more).path
         directory = RunDirectory(self.processes.same_directory(path))
         self.path = directory.path
         with self._held(directory):
@@ -143,7 +145,7 @@ class Recorder:
     def _from_the_start(self, training: TrainingSession, directory: RunDirectory, stop: Stop | None) -> Recorded:
         for line in announcement.first_lines(training, directory) if self.processes.first else ():
             self.say(line)
-        state, row = training.start()
+        state, row = training.start(starting.of_directory(directory.path))
         if self.processes.first:
             directory.append(row)
             for logger in self.loggers:
@@ -181,6 +183,7 @@ class Recorder:
                     "total_steps="
                 )
             state = checkpoint.restore(saved, training.trainer, training.share)
+            training.best.restore(saved, training.share)
             watch = self._watch(training, self._diverged(training, directory, state, done))
             if self.processes.first:
                 self.say(f"{directory.path} has come to its end; its figures and its summary are made")
@@ -192,6 +195,7 @@ class Recorder:
                 self.say(line)
             self.say(f"resumed from the checkpoint of env step {done:,}")
         state = checkpoint.restore(saved, training.trainer, training.share)
+        training.best.restore(saved, training.share)
         self.processes.barrier()  # the files are changed only when all have what they need
         if self.processes.first:
             checkpoint.set_aside_after(directory.checkpoints, done)
@@ -235,7 +239,8 @@ class Recorder:
             keep = settings.keep_checkpoints
             if self.processes.first:
                 directory.sync()
-            checkpoint.save(directory.checkpoints, step, training.trainer, state, keep, share=training.share)
+            own = {"share": training.share, "best": training.best}
+            checkpoint.save(directory.checkpoints, step, training.trainer, state, keep, **own)
 
         outcome = run(training, state, row, loggers, save, stop, save_first=fresh)
         step = int(outcome.row["step"][0])
@@ -255,6 +260,9 @@ class Recorder:
     ) -> None:
         diverged, with_q_bias = self._by_number(training, watch), training.config.diagnostics.q_bias
         title = announcement.title(training)
+        last = directory.checkpoints / str(checkpoint.steps(directory.checkpoints)[-1])
+        numbers = range(training.config.seed, training.config.seed + training.config.seeds)
+        facts = {**facts, **best.summary(last, numbers)}
         found = finish.finish(directory, training.layout, title, with_q_bias, done, facts, diverged)
         for line in announcement.last_lines(training, directory, found, diverged):
             self.say(line)

@@ -12,7 +12,7 @@ Row = dict[str, np.ndarray]
 """Columns of the metrics table for one interval: each [seeds]; "step" and "seed" among them."""
 
 LEARNING_COLUMNS = ("critic_loss", "q_value", "actor_loss")
-"""Of each agent; means over the updates of an interval."""
+"""Of each agent that learns; means over the updates of an interval."""
 
 
 def of_interval(
@@ -46,8 +46,8 @@ def of_interval(
     losses = metrics.update._asdict() if metrics.update is not None else {}
     for name in LEARNING_COLUMNS:
         values = np.asarray(losses[name], np.float64)[:count].mean(axis=1) if losses else None
-        for i, agent in enumerate(layout.agents):
-            row[f"{agent}_{name}"] = np.full(count, np.nan) if values is None else values[:, i]
+        for i in layout.learners:
+            row[f"{layout.agents[i]}_{name}"] = np.full(count, np.nan) if values is None else values[:, i]
     return row
 
 
@@ -56,4 +56,4 @@ def columns(layout: JointLayout) -> Sequence[str]:
     names = ["step", "seed", "updates", "episodes", "episode_length"]
     names += [f"return_{team}" for team in dict.fromkeys(layout.teams)]
     names += [f"{agent}_return" for agent in layout.agents]
-    return names + [f"{agent}_{name}" for name in LEARNING_COLUMNS for agent in layout.agents]
+    return names + [f"{agent}_{name}" for name in LEARNING_COLUMNS for agent in layout.learning_agents]

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -14,6 +14,7 @@ from matd3_jax import envs
 from matd3_jax.config import Config
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import HyperParams
+from matd3_jax.core.q_bias import Values
 from matd3_jax.core.rollout import Evaluation
 from matd3_jax.envs.environment import Environment
 from matd3_jax.envs.wrappers.joint_team import JointTeam
@@ -22,7 +23,8 @@ from matd3_jax.runs import overestimation
 from matd3_jax.runs.missing import Expected
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
-from matd3_jax.training import memory, rows
+from matd3_jax.training import memory, rows, starting
+from matd3_jax.training.best import BestPolicies
 from matd3_jax.training.clock import Clock
 from matd3_jax.training.evaluator import Evaluator
 from matd3_jax.training.loop import TrainLoop
@@ -90,6 +92,7 @@ class TrainingSession:
         local = jax.local_devices()
         least = config.normalize_least_deviation
         options: dict[str, Any] = {"normalize_observations": normalize, "least_deviation": least}
+        options["earlier_statistics"] = config.init is not None
         trainer = TrainLoop(self.env, self.layout, schedule, hyper, seeds, local, **options)
         # Whole intervals of equal length, so that one compiled program does for all; as many as come closest to
         # log_every.
@@ -107,6 +110,10 @@ class TrainingSession:
         kept = config.diagnostics.q_bias_rollouts if config.diagnostics.q_bias else 0
         self.trainer = TrainLoop(self.env, self.layout, schedule, hyper, seeds, local, q_bias_pairs=kept, **options)
         self.evaluator = Evaluator(self.trainer)
+        learning = [self.layout.teams[i] for i in self.layout.learners]
+        judged = "agents" if "agents" in learning else learning[0]
+        self.best = BestPolicies(seeds, self.team_weights(judged))
+        """Of this process's seeds, by the return of the team "agents" (frozen: of the adversaries)."""
         self.networks_finite = np.ones(self.share.total, bool)
         """[seeds of all processes, in the first of them] whether each seed's networks were finite in the last row."""
 
@@ -146,10 +153,18 @@ class TrainingSession:
         """One key a seed; a seed's key does not depend on the other seeds."""
         return jax.vmap(jax.random.key)(self.seeds)
 
-    def start(self) -> tuple[TrainState, Row]:
-        """The state after the warm-up, and what the untrained policies got there (of all processes in the first)."""
+    def start(self, given: Mapping[str, np.ndarray] | None = None) -> tuple[TrainState, Row]:
+        """The state after the warm-up, and what the untrained policies got there (of all processes in the first).
+
+        Args:
+            given: what the seeds of all processes begin with from other runs, as `starting.gather` gives it; None:
+                it is read there, where the settings want any.
+        """
         self.check_memory()
-        state, episodes = self.trainer.warm_up(self.trainer.init(self.keys()))
+        if given is None:
+            given = starting.gather(self)
+        state = starting.put(self.trainer, self.trainer.init(self.keys()), given, self.share)
+        state, episodes = self.trainer.warm_up(state)
         row = self.row(state, Metrics(episodes, None))  # type: ignore[arg-type]
         state, columns = self._evaluated(state, due=True)
         return state, self._gathered(state, row | columns)
@@ -198,7 +213,7 @@ class TrainingSession:
     def columns(self) -> list[str]:
         """The names of the metrics table's columns, in their order."""
         names = [*rows.columns(self.layout), *self.evaluation_columns(None)]
-        judged = overestimation.columns(self.layout.agents, None, 0) if self.config.diagnostics.q_bias else {}
+        judged = overestimation.columns(self.layout.learning_agents, None, 0) if self.config.diagnostics.q_bias else {}
         return names + list(judged)
 
     def expected_table(self, config: Config) -> Expected:
@@ -266,6 +281,7 @@ class TrainingSession:
             returns, length, measures = (np.full((len(self.seeds), size), np.nan) for size in sizes)
         else:
             found = self.evaluate(state, self.config.eval_episodes, deterministic=True)
+            self.best.note(self.step(state), state, found.episode_return)
             returns, length, measures = (leaf.mean(axis=1).reshape(len(self.seeds), -1) for leaf in found)
         columns = {
             f"eval_return_{team}": returns @ self.team_weights(team) for team in dict.fromkeys(self.layout.teams)
@@ -285,4 +301,6 @@ class TrainingSession:
         if due and int(state.rollouts) > int(state.reservoir.since):
             found = self.evaluator.measure_q_bias(state, self.config.diagnostics.q_bias_steps)
             state = self.evaluator.restart_reservoir(state)
-        return state, overestimation.columns(self.layout.agents, found, len(self.seeds))
+        if found is not None:
+            found = Values(*(leaf[..., np.array(self.layout.learners)] for leaf in found))
+        return state, overestimation.columns(self.layout.learning_agents, found, len(self.seeds))

@@ -29,6 +29,8 @@ class TrainState(NamedTuple):
     """Of the observations in all rollouts; None where they are not normalized."""
     reservoir: Reservoir | None = None
     """What the critics are judged on (see `q_bias`); None where they are not. `since` has no axis [seeds]."""
+    earlier: chex.Array | None = None
+    """[seeds] how many rollouts the statistics were made of when the run began; None where it began without any."""
 
 
 class Metrics(NamedTuple):
@@ -40,21 +42,28 @@ class Metrics(NamedTuple):
     """Means over the updates of the iteration (actor_loss over those that moved the actor)."""
 
 
-def prefix(seeds: Any, everywhere: Any, normalize: bool, reservoir: bool) -> TrainState:
+def prefix(seeds: Any, everywhere: Any, normalize: bool, reservoir: bool, earlier: bool = False) -> TrainState:
     """Make a prefix tree of the state: `seeds` for leaves with the axis [seeds], `everywhere` for those without."""
     statistics = seeds if normalize else None
     kept = Reservoir(seeds, everywhere) if reservoir else None
-    return TrainState(seeds, seeds, seeds, seeds, everywhere, statistics, kept)
+    return TrainState(seeds, seeds, seeds, seeds, everywhere, statistics, kept, seeds if earlier else None)
 
 
 def initial(
-    env: Environment, layout: JointLayout, num_envs: int, normalize: bool, q_bias_pairs: int, keys: chex.PRNGKey
+    env: Environment,
+    layout: JointLayout,
+    num_envs: int,
+    normalize: bool,
+    q_bias_pairs: int,
+    earlier: bool,
+    keys: chex.PRNGKey,
 ) -> TrainState:
     """Begin the runs of `keys` [seeds], with an empty replay.
 
     Args:
         normalize: with running statistics of the observations.
         q_bias_pairs: states and actions that the reservoir has room for; 0: there is none.
+        earlier: with a place for how many rollouts given statistics were made of.
     """
 
     def one(key):
@@ -66,6 +75,8 @@ def initial(
     if q_bias_pairs:
         pairs = jax.vmap(lambda s: q_bias.allocate(s, q_bias_pairs, layout))(envs.state)
         state = state._replace(reservoir=Reservoir(pairs, jnp.int32(0)))
+    if earlier:
+        state = state._replace(earlier=jnp.zeros(keys.shape[0]))
     if not normalize:
         return state
     fresh = running_statistics.initial(layout.observation_size)

@@ -98,6 +98,16 @@ class ParticleTask(Environment):
             return Box(2 + self.dim_c * speaks, -1.0, 1.0)
         return Box(sum(choices), 0.0, 1.0)
 
+    @property
+    def action_names(self) -> tuple[tuple[str, ...], ...]:
+        turned = self.actions == "soft" and self.rules == "orig"  # see `_control`
+        pushes = ("+x", "-x", "+y", "-y") if turned else ("-x", "+x", "-y", "+y")
+        moves = ("force x", "force y") if self._as_force else ("stay", *(f"push {way}" for way in pushes))
+        says = tuple(f"say {k}" for k in range(self.dim_c))
+        return tuple(
+            moves * moving + says * speaking for moving, speaking in zip(self.world.movable, self.speaks, strict=True)
+        )
+
     def reset(self, key: chex.PRNGKey) -> tuple[State, tuple[chex.Array, ...]]:
         """Agents uniform on [-1, 1]^2, landmarks within `landmark_range` likewise, at rest and silent."""
         world = self.world

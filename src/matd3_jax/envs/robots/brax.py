@@ -11,6 +11,7 @@ import numpy as np
 
 from matd3_jax.envs.environment import LIMIT, Environment, TimeStep, check_choice, check_count
 from matd3_jax.envs.robots import brax_models as models
+from matd3_jax.envs.robots import names
 from matd3_jax.envs.robots.partition.partition import Partition, Split, as_split, partition
 from matd3_jax.envs.spaces import Box
 
@@ -91,6 +92,18 @@ class BraxRobot(Environment):
     @property
     def full_observation_size(self) -> int:
         return models.layout(self.robot).size
+
+    @property
+    def observation_names(self) -> tuple[tuple[str, ...], ...]:
+        return names.share(self.full_observation_names, self.partition.observations)
+
+    @property
+    def full_observation_names(self) -> tuple[str, ...]:
+        return names.full_observation(models.layout(self.robot), self.mj_model)
+
+    @property
+    def action_names(self) -> tuple[tuple[str, ...], ...]:
+        return names.share(names.actuators(self.mj_model), self.partition.actuators)
 
     @property
     def measures(self) -> tuple[str, ...]:

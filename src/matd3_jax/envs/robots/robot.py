@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from matd3_jax.envs.environment import LIMIT, Environment, TimeStep, check_count
+from matd3_jax.envs.robots import names
 from matd3_jax.envs.robots.engines import engine
 from matd3_jax.envs.robots.engines.engine import Engine, Physical
 from matd3_jax.envs.robots.partition.partition import Layout, Partition, Split, as_split, describe, partition
@@ -129,6 +130,18 @@ class Robot(Environment):
     @property
     def full_observation_size(self) -> int:
         return self.layout.size
+
+    @property
+    def observation_names(self) -> tuple[tuple[str, ...], ...]:
+        return names.share(self.full_observation_names, self.partition.observations)
+
+    @property
+    def full_observation_names(self) -> tuple[str, ...]:
+        return names.full_observation(self.layout, self.mj_model)
+
+    @property
+    def action_names(self) -> tuple[tuple[str, ...], ...]:
+        return names.share(names.actuators(self.mj_model), self.partition.actuators)
 
     @property
     def measures(self) -> tuple[str, ...]:

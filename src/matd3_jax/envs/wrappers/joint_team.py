@@ -75,6 +75,26 @@ class JointTeam(Environment):
         return self.env.full_observation_size
 
     @property
+    def observation_names(self) -> tuple[tuple[str, ...], ...] | None:
+        names = self.env.observation_names
+        if names is None or self._everybody:
+            whole = self.env.full_observation_names
+            return None if whole is None or names is None else (whole,)
+        joined = tuple(f"{self.env.agents[i]}: {name}" for i in self.members for name in names[i])
+        return self._replace(names, joined)
+
+    @property
+    def full_observation_names(self) -> tuple[str, ...] | None:
+        return self.env.full_observation_names
+
+    @property
+    def action_names(self) -> tuple[tuple[str, ...], ...] | None:
+        names = self.env.action_names
+        if names is None:
+            return None
+        return self._replace(names, tuple(f"{self.env.agents[i]}: {name}" for i in self.members for name in names[i]))
+
+    @property
     def measures(self) -> tuple[str, ...]:
         return self.env.measures
 

@@ -1,0 +1,222 @@
+"""Networks of other runs, taken out agent by agent and laid out for a run that begins with them."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from matd3_jax.config import Config
+from matd3_jax.config.schema import AlgoConfig
+from matd3_jax.core.agents import JointLayout
+from matd3_jax.core.frozen import Scale
+from matd3_jax.core.running_statistics import CLIP, LEAST_VARIANCE, Statistics
+from matd3_jax.core.update import GroupState
+from matd3_jax.errors import UserError
+from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.training import saved_policies
+from matd3_jax.training.session import TrainingSession
+from matd3_jax.training.state import TrainState
+
+if TYPE_CHECKING:
+    from matd3_jax.training.starting import Leaves
+
+NETWORKS = ("actor", "critic", "actor_target", "critic_target")
+
+
+class Source:
+    """A run whose networks are taken.
+
+    Args:
+        key: of the setting that names it, for messages.
+        checkpoint: "last", "best" or an env step; None: the last.
+        seeds: numbers of the seeds that begin with it.
+        fixed: number of the one seed that all of them take; None: seed s takes s, counted round where there are fewer.
+    """
+
+    def __init__(self, key: str, path: str, checkpoint: str | None, seeds: Sequence[int], fixed: int | None):
+        self.name = f"{key}={path}"
+        try:
+            run, self.settings = RunDirectory.open(Path(path))
+        except UserError as error:
+            raise UserError(f"{self.name}: {error}") from error
+        self.training = TrainingSession(self.settings)
+        which = int(checkpoint) if checkpoint is not None and checkpoint.isdigit() else checkpoint
+        try:
+            saved = saved_policies.load(run, self.training, which)
+            whole = saved if not saved.best else saved_policies.load(run, self.training, None)
+        except UserError as error:
+            raise UserError(f"{self.name}: {error}") from error
+        first, last = self.settings.seed, self.settings.seed + self.settings.seeds - 1
+        if fixed is not None and not first <= fixed <= last:
+            seed_key = "init_seed" if key == "init" else f"{key}_seed"
+            raise UserError(f"{seed_key}={fixed}: the seeds of {path} are {first} to {last}")
+        self.rows = np.array([(fixed if fixed is not None else s) - first for s in seeds]) % self.settings.seeds
+        for row in self.rows:
+            if not (saved.finite[row] and whole.finite[row]):
+                seed_key = "init_seed" if key == "init" else f"{key}_seed"
+                raise UserError(f"{self.name}: seed {first + row} diverged there; choose another with {seed_key}=")
+        self.policies, self.state = saved.state, whole.state
+
+    @property
+    def layout(self) -> JointLayout:
+        return self.training.layout
+
+    def place(self, agent: str) -> tuple[int, int, int]:
+        """(number, group, place in it) of an agent there."""
+        if agent not in self.layout.agents:
+            raise UserError(f"{self.name}: there is no {agent} there, but {', '.join(self.layout.agents)}")
+        number = self.layout.agents.index(agent)
+        return (number, *self.layout.place(number))
+
+    def networks(self, agent: str) -> GroupState:
+        """All that is trained on of an agent, leading axis [seeds]."""
+        _, g, k = self.place(agent)
+        group = self.state.groups[g]
+        if group.critic is None:
+            raise UserError(f"{self.name}: {agent} did not learn there and has no critics")
+        found = group._replace(actor_optimizer=None, critic_optimizer=None)  # type: ignore[arg-type]
+        if self.policies is not self.state:  # of best evaluations there are actors alone
+            best = self.policies.groups[g]
+            found = found._replace(actor=best.actor, actor_target=best.actor, actor_average=best.actor_average)
+        return self._taken(found, k)
+
+    def actor(self, agent: str) -> tuple[Any, Scale]:
+        """What an agent plays when it is evaluated there: parameters, and how it sees observations; leading axis
+        [seeds]."""
+        number, g, k = self.place(agent)
+        group = self.policies.groups[g]
+        played = self._taken(group.actor if group.actor_average is None else group.actor_average, k)
+        if group.scale is not None:
+            return played, self._taken(group.scale, k)
+        size, seeds = self.layout.observation_sizes[number], len(self.rows)
+        statistics = self.training.trainer.scale(self.policies)
+        if statistics is None:
+            ones, most = np.ones((seeds, size), np.float32), np.finfo(np.float32).max
+            return played, Scale(0 * ones, ones, np.full(seeds, most, np.float32))
+        own = self.part(statistics, agent)
+        deviation = np.sqrt(own.variance + np.float32(LEAST_VARIANCE))
+        return played, Scale(own.mean, deviation, np.full(seeds, CLIP, np.float32))
+
+    def part(self, statistics: Statistics, agent: str) -> Statistics:
+        """The statistics of one agent's observations, leading axis [seeds]."""
+        number, *_ = self.place(agent)
+        return Statistics(*(self.layout.observation_part(np.asarray(leaf)[self.rows], number) for leaf in statistics))
+
+    def _taken(self, tree: Any, member: int) -> Any:
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[self.rows, member], tree)
+
+
+def of(settings: Config, training: TrainingSession) -> "Leaves":
+    """What the seeds of one run begin with.
+
+    Args:
+        training: of settings with the same programs.
+    """
+    seeds = range(settings.seed, settings.seed + settings.seeds)
+    layout, template = training.layout, training.trainer.abstract_state()
+    init = None
+    if settings.init is not None:
+        init = Source("init", settings.init, settings.init_checkpoint, seeds, settings.init_seed)
+        _check_normalization(settings, init)
+    groups = []
+    for g, group in enumerate(layout.groups):
+        algo = settings.teams()[layout.teams[group.members[0]]]
+        names = [layout.agents[i] for i in group.members]
+        wanted = template.groups[g]
+        if group.frozen:
+            groups.append(_frozen(settings, algo, layout, group.members, wanted, seeds))
+        elif init is not None:
+            members = []
+            for name, number in zip(names, group.members, strict=True):
+                _check_actions(init, layout, number)
+                found = init.networks(name)
+                if wanted.actor_average is None:
+                    found = found._replace(actor_average=None)
+                elif found.actor_average is None:
+                    found = found._replace(actor_average=found.actor)
+                for part in NETWORKS:
+                    _check_shapes(init.name, part, name, getattr(found, part), getattr(wanted, part))
+                members.append(found)
+            groups.append(_stacked(members))
+        else:
+            groups.append(_nothing(GroupState))
+    start = _nothing(TrainState)._replace(groups=tuple(groups))
+    if init is not None and settings.normalize_observations:
+        parts = [init.part(init.state.statistics, name) for name in layout.agents]  # type: ignore[arg-type]
+        joint = Statistics(*(np.concatenate(leaves, axis=-1) for leaves in zip(*parts, strict=True)))
+        rollouts = int(init.state.rollouts) + np.zeros(len(seeds), np.float32)
+        if init.state.earlier is not None:
+            rollouts += np.asarray(init.state.earlier)[init.rows]
+        there, here = init.training.trainer.schedule.rollout_steps, training.trainer.schedule.rollout_steps
+        start = start._replace(statistics=joint, earlier=(rollouts * (there / here)).astype(np.float32))
+    return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_flatten_with_path(start)[0]}
+
+
+def _frozen(
+    settings: Config, algo: AlgoConfig, layout: JointLayout, members: Sequence[int], wanted: GroupState,
+    seeds: Sequence[int],
+) -> GroupState:  # fmt: skip
+    """The policies of a frozen group."""
+    key = "algo.policy" if algo is settings.algo else "adversary.policy"
+    source = Source(key, str(algo.policy), algo.policy_checkpoint, seeds, algo.policy_seed)
+    found = []
+    for number in members:
+        name = layout.agents[number]
+        _check_actions(source, layout, number)
+        actor, scale = source.actor(name)
+        _check_shapes(source.name, "actor", name, actor, wanted.actor)
+        found.append(_nothing(GroupState)._replace(actor=actor, scale=scale))
+    return _stacked(found)
+
+
+def _check_actions(source: Source, layout: JointLayout, agent: int) -> None:
+    """Raise UserError where an agent acts or sees otherwise than there."""
+    name = layout.agents[agent]
+    number, *_ = source.place(name)
+    there, here = source.layout.action_spaces[number], layout.action_spaces[agent]
+    if there != here:
+        raise UserError(f"{source.name}: {name} acts in {there} there, in {here} here")
+    seen, shown = source.layout.observation_sizes[number], layout.observation_sizes[agent]
+    if seen != shown:
+        raise UserError(
+            f"{source.name}: the actor of {name} does not fit: its layer 0 reads {seen} numbers there, {shown} here"
+        )
+
+
+def _check_shapes(name: str, part: str, agent: str, there: Any, here: Any) -> None:
+    """Raise UserError for the first layer of a network that has another shape there than here.
+
+    Args:
+        there: parameters, leading axis [seeds].
+        here: shapes, leading axes [seeds, members].
+    """
+    found, wanted = ({path: leaf.shape for path, leaf in _paths(tree)} for tree in (there, here))
+    for path in dict.fromkeys([*wanted, *found]):
+        a = list(found[path][1:]) if path in found else "none"
+        b = list(wanted[path][2:]) if path in wanted else "none"
+        if a != b:
+            raise UserError(
+                f"{name}: the {part.replace('_', ' ')} of {agent} does not fit: {path} is {a} there, {b} here"
+            )
+
+
+def _check_normalization(settings: Config, source: Source) -> None:
+    for key in ("normalize_observations", "normalize_least_deviation"):
+        here, there = getattr(settings, key), getattr(source.settings, key)
+        if here != there:
+            raise UserError(f"{source.name}: its networks were trained with {key}={there}; {key}={here} here")
+
+
+def _paths(tree: Any) -> Iterator[tuple[str, Any]]:
+    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
+        yield ".".join(str(getattr(key, "key", key)) for key in path), leaf
+
+
+def _stacked(members: Sequence[GroupState]) -> GroupState:
+    return jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *members)
+
+
+def _nothing(cls: Any) -> Any:
+    return cls(*(None for _ in cls._fields))
