@@ -14,12 +14,12 @@ import numpy as np
 from matd3_jax.envs.environment import Environment, TimeStep
 from matd3_jax.envs.host import pickling
 from matd3_jax.envs.host.call import bits, call, floats
-from matd3_jax.envs.host.pool import Pool, Simulation
+from matd3_jax.envs.host.pool import TERMINATED, TRUNCATED, Pool, Simulation
 from matd3_jax.envs.spaces import Box
 from matd3_jax.errors import OptionError
 
-RUNNING, TERMINATED, TRUNCATED = 0, 1, 2
-"""Bits of `HostState.end`."""
+RUNNING = 0
+"""`HostState.end` of an episode that has not ended."""
 
 
 class HostState(NamedTuple):
@@ -32,7 +32,7 @@ class HostState(NamedTuple):
     seed: chex.Array
     """int32 scalar: that the copy was reset with."""
     end: chex.Array
-    """int32 scalar: `RUNNING`, or bits of how the episode ended; after that nothing moves any more."""
+    """int32 scalar: `RUNNING`, or bits of how the episode ended (`pool.TERMINATED`, `TRUNCATED`); after that nothing moves any more."""
     seen: chex.Array
     """float32 [seen_size]: all that is to be seen."""
 
@@ -109,7 +109,7 @@ class HostEnvironment(Environment):
         return after, going, self.observe(going)
 
     def _row(self, state: HostState, action: tuple[chex.Array, ...]) -> chex.Array:
-        return jnp.concatenate([jnp.stack([state.number, state.step, state.seed, state.end]), self.played(action)])
+        return jnp.concatenate([jnp.stack([state.end, state.number, state.step, state.seed]), self.played(action)])
 
     def played(self, action: tuple[chex.Array, ...]) -> chex.Array:
         """All actions as the simulation takes them: int32, those of boxes as bits."""
@@ -137,11 +137,10 @@ class HostEnvironment(Environment):
     @cached_property
     def pool(self) -> Pool:
         """The copies of this environment."""
-        return Pool(self.simulation, self.threads, self.name)
+        return Pool(self.simulation, self.threads, self.episode_length, self.name)
 
     def _reset(self, rows: np.ndarray) -> np.ndarray:
-        numbers, seen = self.pool.reset(rows[:, 0])
-        return np.concatenate([numbers[:, None].astype(np.int32), _as_bits(seen)], axis=1)
+        return self.pool.reset(rows[:, 0])
 
     def _step(self, rows: np.ndarray) -> np.ndarray:
         return self._stepped(rows, None)
@@ -150,29 +149,14 @@ class HostEnvironment(Environment):
         return self._stepped(rows[:, 1:], rows[:, 0])
 
     def _stepped(self, rows: np.ndarray, reset_seeds: np.ndarray | None) -> np.ndarray:
-        """Rows (number, end, rewards, seen) of those that are still running, of others zeros; with `reset_seeds` also
-        what is seen where a copy was reset."""
-        size = 2 + self.num_rewards + self.seen_size
-        answer = np.zeros((len(rows), size + (0 if reset_seeds is None else self.seen_size)), np.int32)
-        answer[:, 0] = rows[:, 0]
-        going = np.flatnonzero(rows[:, 3] == RUNNING)
-        numbers, steps, seeds = rows[going, :3].T
-        taken = self.pool.take(numbers, steps, seeds)
-        found = self.pool.step(taken, seeds, rows[going, 4:], self.episode_length)
-        ended = []
-        for row, (number, slot, outcome, seen) in zip(going, found, strict=True):
-            end = TERMINATED * outcome.terminated | TRUNCATED * outcome.truncated
-            answer[row, :2] = number, end
-            answer[row, 2:size] = np.concatenate([outcome.reward, seen], dtype=np.float32, casting="unsafe").view(
-                np.int32
-            )
-            if end != RUNNING:
-                ended.append((row, number, slot))
-        if reset_seeds is None:
-            self.pool.release([number for _, number, _ in ended])
-        elif ended:
-            fresh = self.pool.restart([slot for *_, slot in ended], [int(reset_seeds[row]) for row, *_ in ended])
-            answer[[row for row, *_ in ended], size:] = _as_bits(fresh)
+        """`Pool.step` of the episodes that have not ended, of others zeros. rows: (end, number, step, seed, actions)."""
+        going = np.flatnonzero(rows[:, 0] == RUNNING)
+        size = 2 + self.num_rewards + self.seen_size * (1 if reset_seeds is None else 2)
+        answer = np.zeros((len(rows), size), np.int32)
+        answer[:, 0] = rows[:, 1]
+        if len(going):
+            seeds = None if reset_seeds is None else reset_seeds[going]
+            answer[going] = self.pool.step(rows[going, 1:], seeds)
         return answer
 
     # ---- checkpoints -------------------------------------------------------------------------------------------------
@@ -193,7 +177,7 @@ class HostEnvironment(Environment):
 
     def check_pickle(self) -> None:
         """Raise OptionError unless a copy in the middle of an episode can be pickled."""
-        used = self.pool.reset(np.zeros(1, np.int32))[0].tolist()
+        used = self.pool.reset(np.zeros(1, np.int32))[:, 0].tolist()
         try:
             used += self.load(self.dump(np.array(used))).tolist()
         finally:
@@ -208,7 +192,3 @@ def cores() -> int:
 def _seed(key: chex.PRNGKey) -> chex.Array:
     """A seed that any library takes, of a key: int32, not negative."""
     return (jax.random.bits(key, (), jnp.uint32) >> 1).astype(jnp.int32)
-
-
-def _as_bits(seen: list[np.ndarray]) -> np.ndarray:
-    return np.stack([np.ascontiguousarray(one, np.float32) for one in seen]).view(np.int32)

@@ -5,6 +5,7 @@ import itertools
 import os
 import sys
 import threading
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, Protocol
@@ -12,6 +13,13 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from matd3_jax.errors import HostError
+
+
+TERMINATED, TRUNCATED = 1, 2
+"""Bits of how an episode ended."""
+
+REMEMBERED = 1024
+"""Copies that were given back whose last answer is kept."""
 
 
 class Outcome(NamedTuple):
@@ -47,25 +55,40 @@ class Slot:
 
     def __init__(self, simulation: Simulation, seed: int, step: int = 0):
         self.simulation, self.seed, self.step = simulation, seed, step
+        self.last: Answered | None = None
+
+
+class Answered(NamedTuple):
+    """A question, and what was answered."""
+
+    asked: bytes
+    answer: np.ndarray
 
 
 class Pool:
     """Copies of one environment, made as they are needed, each under the number that states of the program bear.
 
-    A state is only a reference, so it goes forward alone: the copy is where the last step left it. A state at the
-    beginning of an episode is more: it can be stepped any number of times, as its seed makes it anew.
+    A state is only a reference, so it goes forward alone: the copy is where the last step left it. Two exceptions make
+    calls from a compiled program safe. A state at the beginning of an episode can be stepped any number of times, as its
+    seed makes it anew: a program may have one reset for several episodes with the same key. And what was asked last of a
+    copy is answered again without a step.
+
+    Questions and answers are rows of int32, real numbers in them as their float32 bits. All methods can be called from
+    several threads.
 
     Args:
         make: a new copy.
         threads: that share a batch; more than one helps where stepping releases Python's lock, as MuJoCo does.
+        limit: env steps after which an episode is truncated.
         name: of the environment, for errors.
     """
 
-    def __init__(self, make: Callable[[], Simulation], threads: int, name: str):
-        self._make, self._threads, self._name = make, threads, name
+    def __init__(self, make: Callable[[], Simulation], threads: int, limit: int, name: str):
+        self._make, self._threads, self._limit, self._name = make, threads, limit, name
         self._lock, self._numbers = threading.Lock(), itertools.count()
         self._used: dict[int, Slot] = {}
         self._free: list[Simulation] = []
+        self._ended: OrderedDict[int, Answered] = OrderedDict()
         # Never in the thread of the compiled program: there, making MuJoCo's data ended the process.
         self._executor = ThreadPoolExecutor(max(threads, os.cpu_count() or 1), thread_name_prefix="environments")
 
@@ -74,76 +97,40 @@ class Pool:
         """How many copies are in the middle of an episode."""
         return len(self._used)
 
-    def give(self, simulation: Simulation) -> None:
-        """Add a copy that nobody uses."""
-        with self._lock:
-            self._free.append(simulation)
+    def reset(self, seeds: np.ndarray) -> np.ndarray:
+        """Begin episodes: rows (number of the copy, seen)."""
 
-    # ---- for the program: rows of int32, a robot or game each -------------------------------------------------------
-
-    def reset(self, seeds: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Begin episodes: the copies' numbers [rows], and what is seen in each."""
-
-        def begin(seed: int) -> tuple[int, np.ndarray]:
+        def begin(seed: int) -> np.ndarray:
             number, slot = self._begin(int(seed))
-            return number, slot.simulation.seen()
+            return np.concatenate([np.array([number], np.int32), self._seen(slot)])
 
-        found = self._each(begin, seeds)
-        return np.array([number for number, _ in found]), [seen for _, seen in found]
+        return np.stack(self._each(begin, seeds))
 
-    def take(self, numbers: np.ndarray, steps: np.ndarray, seeds: np.ndarray) -> list[tuple[int, Slot | None]]:
-        """Claim the copies of states for the next step: (number, copy), None for one that is yet to be made.
+    def step(self, rows: np.ndarray, reset_seeds: np.ndarray | None = None) -> list[np.ndarray]:
+        """Step copies: rows (number of the copy, `TERMINATED` and `TRUNCATED`, rewards, seen).
 
-        Raises HostError where a copy has gone on from the state.
+        Args:
+            rows: (number, env steps so far, seed, actions).
+            reset_seeds: begin new episodes with these in the copies whose episodes end, and append what is seen then,
+                of others zeros. None: such copies are given back.
+
+        Raises HostError where a copy has gone on from the state that a row stands for.
         """
-        found: list[tuple[int, Slot | None]] = []
-        with self._lock:
-            for number, step, seed in zip(numbers.tolist(), steps.tolist(), seeds.tolist(), strict=True):
-                slot = self._used.get(number)
-                if slot is not None and (slot.step, slot.seed) == (step, seed):
-                    slot.step += 1
-                    found.append((number, slot))
-                elif step == 0:
-                    found.append((number, None))
-                else:
-                    raise HostError(
-                        f"{self._name} cannot be put back to an earlier state (env step {step} of an episode): it is "
-                        "stepped in Python, and states are references to it"
-                    )
-        return found
+        seeds = np.full(len(rows), -1) if reset_seeds is None else reset_seeds
+        claimed = self._claim(rows, seeds)
 
-    def step(
-        self, taken: Sequence[tuple[int, Slot | None]], seeds: np.ndarray, actions: np.ndarray, limit: int
-    ) -> list[tuple[int, Slot, Outcome, np.ndarray]]:
-        """Step claimed copies: (number, copy, outcome, what is seen) each. Truncates at `limit` env steps."""
+        def one(row: int) -> np.ndarray:
+            found = claimed[row]
+            if isinstance(found, Answered):
+                return found.answer
+            number, slot = (int(rows[row, 0]), found) if found is not None else self._begin(int(rows[row, 2]), step=1)
+            answer = self._advance(number, slot, rows[row, 3:], int(seeds[row]))
+            slot.last = Answered(_question(rows[row], seeds[row]), answer)
+            if reset_seeds is None and answer[1]:
+                self._give_back(number, slot)
+            return answer
 
-        def one(row: int) -> tuple[int, Slot, Outcome, np.ndarray]:
-            number, slot = taken[row]
-            if slot is None:
-                number, slot = self._begin(int(seeds[row]))
-                slot.step = 1
-            outcome = self._guarded("step", slot.simulation.step, actions[row])
-            if slot.step >= limit:
-                outcome = outcome._replace(truncated=True)
-            return number, slot, outcome, slot.simulation.seen()
-
-        return self._each(one, range(len(taken)))
-
-    def restart(self, slots: Sequence[Slot], seeds: Sequence[int]) -> list[np.ndarray]:
-        """Begin new episodes in copies that have ended one: what is seen in each."""
-
-        def one(pair: tuple[Slot, int]) -> np.ndarray:
-            slot, seed = pair
-            self._guarded("reset", slot.simulation.reset, seed)
-            slot.seed, slot.step = seed, 0
-            return slot.simulation.seen()
-
-        return self._each(one, list(zip(slots, seeds, strict=True)))
-
-    def release(self, numbers: Sequence[int]) -> None:
-        """Take back copies that have ended an episode."""
-        with self._lock:
-            self._free += [self._used.pop(number).simulation for number in numbers]
+        return self._each(one, range(len(rows)))
 
     # ---- for checkpoints ---------------------------------------------------------------------------------------------
 
@@ -161,10 +148,57 @@ class Pool:
             numbers.append(self._use(Slot(simulation, seed, step)))
         return np.array(numbers, np.int32)
 
+    def release(self, numbers: Sequence[int]) -> None:
+        """Take back copies in the middle of episodes."""
+        with self._lock:
+            self._free += [self._used.pop(number).simulation for number in numbers]
+
     # ---- inside ------------------------------------------------------------------------------------------------------
 
-    def _begin(self, seed: int) -> tuple[int, Slot]:
-        slot = Slot(self._copy(), seed)
+    def _claim(self, rows: np.ndarray, reset_seeds: np.ndarray) -> list[Slot | Answered | None]:
+        """The copy that each row moves, None for one that is yet to be made, or what was answered before."""
+        found: list[Slot | Answered | None] = []
+        with self._lock:
+            for row, reset_seed in zip(rows, reset_seeds, strict=True):
+                number, step, seed = row[:3].tolist()
+                slot = self._used.get(number)
+                if slot is not None and (slot.step, slot.seed) == (step, seed):
+                    slot.step, slot.last = step + 1, None
+                    found.append(slot)
+                    continue
+                last = self._ended.get(number) if slot is None else slot.last
+                if step == 0:
+                    found.append(None)
+                elif last is not None and last.asked == _question(row, reset_seed):
+                    found.append(last)
+                else:
+                    raise HostError(
+                        f"{self._name} cannot be put back to an earlier state (env step {step} of an episode): it is "
+                        "stepped in Python, and states are references to it"
+                    )
+        return found
+
+    def _advance(self, number: int, slot: Slot, action: np.ndarray, reset_seed: int) -> np.ndarray:
+        """Step a claimed copy, and reset it where that ends its episode and a seed is given."""
+        outcome = self._guarded("step", slot.simulation.step, action)
+        end = TERMINATED * outcome.terminated | TRUNCATED * (outcome.truncated or slot.step >= self._limit)
+        head = np.array([number, end], np.int32)
+        reward, seen = np.asarray(outcome.reward, np.float32).view(np.int32), self._seen(slot)
+        if reset_seed < 0:
+            return np.concatenate([head, reward, seen])
+        fresh = np.zeros_like(seen)
+        if end:
+            self._guarded("reset", slot.simulation.reset, reset_seed)
+            slot.seed, slot.step = reset_seed, 0
+            fresh = self._seen(slot)
+        return np.concatenate([head, reward, seen, fresh])
+
+    def _seen(self, slot: Slot) -> np.ndarray:
+        return np.ascontiguousarray(self._guarded("observing", slot.simulation.seen), np.float32).view(np.int32)
+
+    def _begin(self, seed: int, step: int = 0) -> tuple[int, Slot]:
+        """Reset a copy that nobody uses. step: that it is claimed for, 1 of the first."""
+        slot = Slot(self._copy(), seed, step)
         self._guarded("reset", slot.simulation.reset, seed)
         return self._use(slot), slot
 
@@ -179,6 +213,15 @@ class Pool:
             number = next(self._numbers)
             self._used[number] = slot
         return number
+
+    def _give_back(self, number: int, slot: Slot) -> None:
+        with self._lock:
+            if slot.last is not None:
+                self._ended[number] = slot.last
+            while len(self._ended) > REMEMBERED:
+                self._ended.popitem(last=False)
+            del self._used[number]
+            self._free.append(slot.simulation)
 
     def _guarded(self, what: str, function: Callable, *arguments: Any) -> Any:
         try:
@@ -196,6 +239,10 @@ class Pool:
         shares = [items[part::parts] for part in range(parts)]
         done = list(self._executor.map(lambda share: [function(item) for item in share], shares))
         return [done[i % parts][i // parts] for i in range(len(items))]
+
+
+def _question(row: np.ndarray, reset_seed: np.ndarray) -> bytes:
+    return row.tobytes() + reset_seed.tobytes()
 
 
 def quiet() -> contextlib.AbstractContextManager:
