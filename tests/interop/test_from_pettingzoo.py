@@ -68,7 +68,9 @@ def test_batches_of_batches_reset_where_episodes_end():
     state, seen = jax.jit(jax.vmap(jax.vmap(env.reset)))(keys)
     for t in range(1, 8):
         said = jax.random.uniform(jax.random.key(t), (2, 4, 2, 1), minval=-1.0, maxval=1.0)
-        after, state, seen_next = both(keys, jax.random.split(jax.random.key(t), (2, 4)), state, (said[:, :, 0], said[:, :, 1]))
+        after, state, seen_next = both(
+            keys, jax.random.split(jax.random.key(t), (2, 4)), state, (said[:, :, 0], said[:, :, 1])
+        )
         numbers = np.stack([seen[0][..., 0], seen[1][..., 0]], axis=-1)
         np.testing.assert_allclose(after.reward, -np.abs(2 * (said[..., 0] + 1) - 2 * numbers), atol=1e-5)
         end = t % 3 == 0

@@ -51,8 +51,8 @@ def restored(checkpoint: Path, trainer: TrainLoop, state: TrainState, share: Sha
         except Exception as error:  # whatever the environment's own code raises
             words = " ".join(str(error).split())
             raise UserError(
-                f"{file} cannot be unpickled ({type(error).__name__}: {words}); resume without env.pickle=true: episodes "
-                "start anew"
+                f"{file} cannot be unpickled ({type(error).__name__}: {words}); resume without env.pickle=true: "
+                "episodes start anew"
             ) from error
     everywhere = jax.device_put(np.stack(numbers), trainer.shardings.env)
     return state._replace(env=state.env._replace(state=state.env.state._replace(number=everywhere)))
@@ -67,8 +67,8 @@ def notes(checkpoint: Path, trainer: TrainLoop, unpickle: bool) -> list[str]:
         if unpickle:
             return []
         return [
-            f"note: the episodes of {env.name} start anew; to let them go on from the checkpoint's pickles, which can run "
-            "any program, give env.pickle=true once more"
+            f"note: the episodes of {env.name} start anew; to let them go on from the checkpoint's pickles, which can "
+            "run any program, give env.pickle=true once more"
         ]
     return [f"note: the episodes of {env.name} start anew: the checkpoint does not hold them (env.pickle=true would)"]
 

@@ -14,7 +14,7 @@ from matd3_jax.core import minibatch, n_step, q_bias, replay, rollout, running_s
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.q_bias import Pairs
-from matd3_jax.core.rollout import Episodes, EnvState, PolicyParams
+from matd3_jax.core.rollout import EnvState, Episodes, PolicyParams
 from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.core.update import UpdateMetrics
 from matd3_jax.envs.environment import Environment

@@ -71,8 +71,8 @@ class TrainingSession:
         base = envs.make(**config.env) if env is None else env
         if base.on_host and config.diagnostics.q_bias:
             raise UserError(
-                f"diagnostics.q_bias=true puts environments back to earlier states, and {config.env['name']} is stepped "
-                "in Python and only goes forward: leave it false"
+                f"diagnostics.q_bias=true puts environments back to earlier states, and {config.env['name']} is "
+                "stepped in Python and only goes forward: leave it false"
             )
         teams = config.teams()
         if config.adversary is not None and "adversaries" not in base.teams:

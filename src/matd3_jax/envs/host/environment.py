@@ -4,7 +4,7 @@ import abc
 import io
 import os
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import chex
 import jax
@@ -32,7 +32,8 @@ class HostState(NamedTuple):
     seed: chex.Array
     """int32 scalar: that the copy was reset with."""
     end: chex.Array
-    """int32 scalar: `RUNNING`, or bits of how the episode ended (`pool.TERMINATED`, `TRUNCATED`); after that nothing moves any more."""
+    """int32 scalar: `RUNNING`, or bits of how the episode ended (`pool.TERMINATED`, `TRUNCATED`), after which nothing
+    moves any more."""
     seen: chex.Array
     """float32 [seen_size]: all that is to be seen."""
 
@@ -149,7 +150,10 @@ class HostEnvironment(Environment):
         return self._stepped(rows[:, 1:], rows[:, 0])
 
     def _stepped(self, rows: np.ndarray, reset_seeds: np.ndarray | None) -> np.ndarray:
-        """`Pool.step` of the episodes that have not ended, of others zeros. rows: (end, number, step, seed, actions)."""
+        """`Pool.step` of the episodes that have not ended, of others zeros.
+
+        rows: (end, number, step, seed, actions).
+        """
         going = np.flatnonzero(rows[:, 0] == RUNNING)
         size = 2 + self.num_rewards + self.seen_size * (1 if reset_seeds is None else 2)
         answer = np.zeros((len(rows), size), np.int32)

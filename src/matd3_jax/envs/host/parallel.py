@@ -14,7 +14,7 @@ from gymnasium import spaces
 from matd3_jax.envs.environment import check_count
 from matd3_jax.envs.host import sources
 from matd3_jax.envs.host.environment import HostEnvironment, HostState
-from matd3_jax.envs.host.pool import Outcome
+from matd3_jax.envs.host.pool import Outcome, quiet
 from matd3_jax.envs.host.spaces import Actions, flat_size, flatten
 from matd3_jax.envs.spaces import ActionSpace
 from matd3_jax.errors import OptionError, nearest
@@ -50,6 +50,8 @@ class _Parallel(HostEnvironment):
 
     def _settle(self) -> None:
         """Check the options, and ask the environment what it is."""
+        if self.episode_length is not None:
+            check_count("episode_length", self.episode_length, 1)
         name = self.name
         facts = self.facts
         if self.adversaries is not None:
@@ -65,7 +67,6 @@ class _Parallel(HostEnvironment):
                     f"{name} does not say after how many env steps it truncates: give env.episode_length="
                 )
             object.__setattr__(self, "episode_length", facts.limit)
-        check_count("episode_length", self.episode_length, 1)
         if self.pickle:
             self.check_pickle()
 
@@ -153,9 +154,9 @@ class PettingZoo(_Parallel):
     says, in an attribute `max_cycles` for instance); `pickle`, whether checkpoints hold the environments.
 
     Boxes of actions are [-1, 1], stretched to the environment's own bounds; Discrete and MultiDiscrete are what they
-    are. Observations are flattened as `gymnasium.spaces.flatten` does (choices one-hot). An agent that leaves sees zeros
-    and gets reward 0 until the episode ends, and whatever it does is ignored. The episode ends when no agent is left:
-    terminated if all of them were, truncated if one was truncated. `state()`, where there is one, is the full
+    are. Observations are flattened as `gymnasium.spaces.flatten` does (choices one-hot). An agent that leaves sees
+    zeros and gets reward 0 until the episode ends, and whatever it does is ignored. The episode ends when no agent is
+    left: terminated if all of them were, truncated if one was truncated. `state()`, where there is one, is the full
     observation.
 
     Raises OptionError for what cannot be made, or has other spaces.
@@ -186,7 +187,8 @@ class PettingZoo(_Parallel):
             return function(**self.kwargs)
 
         try:
-            return make, make()
+            with quiet():
+                return make, make()
         except Exception as error:
             words = " ".join(str(error).split())
             raise OptionError(

@@ -14,7 +14,6 @@ import numpy as np
 
 from matd3_jax.errors import HostError
 
-
 TERMINATED, TRUNCATED = 1, 2
 """Bits of how an episode ended."""
 
@@ -69,9 +68,9 @@ class Pool:
     """Copies of one environment, made as they are needed, each under the number that states of the program bear.
 
     A state is only a reference, so it goes forward alone: the copy is where the last step left it. Two exceptions make
-    calls from a compiled program safe. A state at the beginning of an episode can be stepped any number of times, as its
-    seed makes it anew: a program may have one reset for several episodes with the same key. And what was asked last of a
-    copy is answered again without a step.
+    calls from a compiled program safe. A state at the beginning of an episode can be stepped any number of times, as
+    its seed makes it anew: a program may have one reset for several episodes with the same key. And what was asked last
+    of a copy is answered again without a step.
 
     Questions and answers are rows of int32, real numbers in them as their float32 bits. All methods can be called from
     several threads.

@@ -48,8 +48,8 @@ def share(split: Shares, size: int, model: Any) -> tuple[tuple[int, ...], ...]:
     entries = [entry for own in split for entry in own]
     if not all(split) or sorted(map(str, entries)) != sorted(map(str, range(size))):
         raise OptionError(
-            f"split={[list(own) for own in split]}: each of the entries 0 to {size - 1} of an action must be exactly one "
-            "agent's, and each agent have one"
+            f"split={[list(own) for own in split]}: each of the entries 0 to {size - 1} of an action must be exactly "
+            "one agent's, and each agent have one"
         )
     return split
 

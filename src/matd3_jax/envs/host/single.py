@@ -49,12 +49,13 @@ class _Single(HostEnvironment):
     def _settle(self) -> None:
         """Check the options, and ask the environment what it is."""
         object.__setattr__(self, "split", sharing.as_split(self.split))
+        if self.episode_length is not None:
+            check_count("episode_length", self.episode_length, 1)
         facts = self.facts
         if self.episode_length is None:
             if facts.limit is None:
                 raise OptionError(f"{self.name} has no time limit of its own: give env.episode_length=")
             object.__setattr__(self, "episode_length", facts.limit)
-        check_count("episode_length", self.episode_length, 1)
         if self.split != "single" and not isinstance(facts.action.ours, Box):
             raise OptionError(f"split={self.split!r}: {self.name} takes {facts.action.ours}; only a Box can be shared")
         self.shares, self.observed  # noqa: B018  # raise for what is impossible
@@ -184,14 +185,14 @@ class _Single(HostEnvironment):
 class Gymnasium(_Single):
     """An environment of gymnasium, its action vector shared out among agents: `env=gymnasium env.id=Ant-v5`.
 
-    Options: `id`, as `gymnasium.make` takes it ("package:Name-v0" imports the package first); `kwargs`, what it is made
-    with; `split` and `observation`, see below; `episode_length`, env steps until truncation (None: the environment's own
-    time limit); `pickle`, whether checkpoints hold the environments.
+    Options: `id`, as `gymnasium.make` takes it ("package:Name-v0" imports the package first); `kwargs`, what it is
+    made with; `split` and `observation`, see below; `episode_length`, env steps until truncation (None: the
+    environment's own time limit); `pickle`, whether checkpoints hold the environments.
 
     `split` (see `sharing.share`): `single`; of robots that have the joints of ours the names of their partitions
     (`halves`, `2x4`, `2x4d`, `4x2` of the Ant); of others `halves` or `NxM`, N agents with M consecutive entries each;
-    or lists of entries, one for each agent. `observation`: `all`, or `own`, of MuJoCo's robots position and velocity of the
-    root and of the agent's own joints. Choices (Discrete) are one agent's. All agents get the environment's reward,
+    or lists of entries, one for each agent. `observation`: `all`, or `own`, of MuJoCo's robots position and velocity of
+    the root and of the agent's own joints. Choices (Discrete) are one agent's. All agents get the environment's reward,
     which is reported once; the full observation is the environment's own, flattened.
 
     `measures` of walking robots: forward_velocity (m/s).
@@ -216,6 +217,7 @@ class Gymnasium(_Single):
 
     def _source(self) -> tuple[Callable[[], Any], Any]:
         import gymnasium
+        import mujoco  # noqa: F401  # so that it is quiet from the first model on
 
         if not isinstance(self.id, str) or not self.id:
             raise OptionError(f"env.id={self.id!r}: must name an environment of gymnasium, for instance env.id=Ant-v5")

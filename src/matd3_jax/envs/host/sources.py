@@ -22,8 +22,8 @@ class Kwargs(Mapping):
             self._text = json.dumps(dict(values), sort_keys=True)
         except TypeError as error:
             raise OptionError(
-                f"kwargs={dict(values)!r}: must be numbers, words, lists and groups of them; hand a function that makes "
-                "the environment to envs.from_pettingzoo or envs.from_gymnasium for others"
+                f"kwargs={dict(values)!r}: must be numbers, words, lists and groups of them; hand a function that "
+                "makes the environment to envs.from_pettingzoo or envs.from_gymnasium for others"
             ) from error
         self._values = json.loads(self._text)
 
@@ -68,14 +68,18 @@ def _module(key: str, name: str, path: str, example: str) -> Any:
             return importlib.import_module(path)
     except ModuleNotFoundError as error:
         if error.name and not (path == error.name or path.startswith(error.name + ".")):
-            raise OptionError(f"{key}={name}: it needs the package {error.name.split('.')[0]}: {_install(error)}") from error
+            raise OptionError(
+                f"{key}={name}: it needs the package {error.name.split('.')[0]}: {_install(error)}"
+            ) from error
         parent, _, last = path.rpartition(".")
         if error.name == path and parent:  # an attribute of its package, which is imported already
             package = importlib.import_module(parent)
             if hasattr(package, last):
                 return getattr(package, last)
             raise OptionError(f"{key}={name}: {parent} has no {last}") from error
-        raise OptionError(f"{key}={name}: there is no module {error.name}; {_install(error)}, or name {example}") from error
+        raise OptionError(
+            f"{key}={name}: there is no module {error.name}; {_install(error)}, or name {example}"
+        ) from error
     except (ImportError, ValueError, TypeError) as error:
         raise OptionError(f"{key}={name}: cannot be imported ({' '.join(str(error).split())})") from error
 
