@@ -1,4 +1,4 @@
-"""Environments in pure JAX under one contract (`environment.Environment`); made by name with `make`.
+"""Environments under one contract (`environment.Environment`), nearly all in pure JAX; made by name with `make`.
 
 Importing this package loads no environment: each is imported when it is first asked for.
 """
@@ -22,6 +22,8 @@ __all__ = [
     "Simplex",
     "TimeStep",
     "check",
+    "from_gymnasium",
+    "from_pettingzoo",
     "make",
     "names",
     "options",
@@ -50,6 +52,8 @@ _CLASSES = {
     "brax_walker2d": (".robots.brax", "BraxWalker2d"),
     "brax_humanoid": (".robots.brax", "BraxHumanoid"),
     "brax_swimmer": (".robots.brax", "BraxSwimmer"),
+    "pettingzoo": (".host.parallel", "PettingZoo"),
+    "gymnasium": (".host.single", "Gymnasium"),
 }
 
 
@@ -83,6 +87,54 @@ def make(name: str, **options_: Any) -> Environment:
         if key not in known:
             raise OptionError(f"{name} has no option {key!r}; {nearest(key, known)}")
     return _find(name)(**options_)
+
+
+def from_pettingzoo(source: Any, **options_: Any) -> Environment:
+    """Take an environment with PettingZoo's parallel API.
+
+    Args:
+        source: a function that makes one, or an instance, which is copied: every seed has copies of its own.
+        options_: `adversaries`, `shared_reward`, `episode_length`, `pickle` (see `host.parallel.PettingZoo`).
+
+    Raises OptionError for what has no parallel API, cannot be copied, or has other spaces than these.
+
+    Example:
+        >>> from mpe2 import simple_push_v3
+        >>> env = from_pettingzoo(lambda: simple_push_v3.parallel_env(max_cycles=10))
+        >>> env.teams, env.observation_sizes, env.episode_length
+        (('adversaries', 'agents'), (8, 19), 10)
+    """
+    from matd3_jax.envs.host.parallel import PettingZooObject
+
+    return _with_options(PettingZooObject, source, options_)
+
+
+def from_gymnasium(source: Any, **options_: Any) -> Environment:
+    """Take an environment of gymnasium, its action vector shared out among agents.
+
+    Args:
+        source: a function that makes one, or an instance, which is copied: every seed has copies of its own.
+        options_: `split`, `observation`, `episode_length`, `pickle` (see `host.single.Gymnasium`).
+
+    Raises OptionError for what is no environment of gymnasium, cannot be copied or shared so, or has other spaces.
+
+    Example:
+        >>> import gymnasium
+        >>> env = from_gymnasium(lambda: gymnasium.make("Reacher-v5"), split="2x1")
+        >>> env.agents, env.action_spaces[0]
+        (('agent_0', 'agent_1'), Box(size=1, low=-1.0, high=1.0))
+    """
+    from matd3_jax.envs.host.single import GymnasiumObject
+
+    return _with_options(GymnasiumObject, source, options_)
+
+
+def _with_options(class_: Any, source: Any, given: dict[str, Any]) -> Environment:
+    known = [field.name for field in dataclasses.fields(class_) if field.name != "source"]
+    for key in given:
+        if key not in known:
+            raise OptionError(f"there is no option {key!r}; {nearest(key, known)}")
+    return class_(source=source, **given)
 
 
 def _find(name: str) -> Any:
