@@ -24,10 +24,13 @@ from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.runtime.terminal import say
 from matd3_jax.sweep import batching
-from matd3_jax.training import checkpoint, finish
+from matd3_jax.tracking.messages import FAILED, FINISHED, STOPPED
+from matd3_jax.training import checkpoint, film, finish, outputs
 from matd3_jax.training import run as training_run
-from matd3_jax.training.loggers import DivergenceLogger, Logger, TableLogger, TensorBoardLogger
+from matd3_jax.training.film import Filmer
+from matd3_jax.training.loggers import CallbackLogger, DivergenceLogger, Logger, TableLogger
 from matd3_jax.training.memory import most_seeds, needed
+from matd3_jax.training.outputs import Outputs
 from matd3_jax.training.progress import ProgressBar
 from matd3_jax.training.session import Row, TrainingSession
 from matd3_jax.training.state import TrainState
@@ -108,8 +111,8 @@ class Sweep:
         for path in _entries(self.runs):
             if path.name not in planned and RunDirectory(path).bare:  # a process was killed while it planned
                 shutil.rmtree(path)
-        if any(config.tensorboard for config in settings.values()):
-            TensorBoardLogger.check()
+        for config in settings.values():
+            outputs.check(config)
         if any(config.on_divergence != "continue" for config in settings.values()):
             raise UserError("on_divergence=stop: a sweep's runs are trained side by side, and none ends the others")
         budget = devices.free_memory(self.processes.local) if budget is None else budget
@@ -200,8 +203,7 @@ class Batch:
         self.members = sweep.members(number)
         self.training = TrainingSession(self.members[0], members=self.members, processes=processes)
         self.checkpoints = sweep.folder_of(number) / "checkpoints"
-        ends = np.cumsum([config.seeds for config in self.members])
-        self.seeds = [slice(end - config.seeds, end) for end, config in zip(ends.tolist(), self.members, strict=True)]
+        self.seeds = film.where(self.members)
         """Where each run's seeds are."""
         self.table = TableLogger(self.runs, self.seeds)
         self.watch = DivergenceLogger(
@@ -212,29 +214,42 @@ class Batch:
 
     def train(self, stop: Stop) -> None:
         """From the last checkpoint, or from the start, to the end or until a signal comes."""
-        training, settings, begun = self.training, self.members[0], time.monotonic()
+        training, begun = self.training, time.monotonic()
         training.check_memory(recorded=True)
         if self.processes.first:
             self._announce()
         state, row, fresh = self._begin()
         loggers: list[Logger] = []
+        out = filmer = None
         if self.processes.first:
+            name = self.sweep.folder.absolute().name
+            out = Outputs(self.runs, self.members, self.seeds, say, say, self.watch.diverged, name)
+            if fresh:
+                out.log(row)
             progress = ProgressBar(training, row, self.watch.diverged)
-            loggers = [self.table, self.watch, progress]
-            if settings.tensorboard:
-                loggers.append(TensorBoardLogger(self.runs, self.seeds))
+            loggers = [self.table, self.watch, progress, CallbackLogger(out.log)]
+            if Filmer.wanted(self.members):
+                filmer = Filmer(training, self.runs, self.members, self.seeds, say, out.attach)
 
         def save(state: TrainState, step: int) -> None:
             for run in self.runs if self.processes.first else ():
                 run.sync()
             checkpoint.save(self.checkpoints, step, training.trainer, state, keep=1, share=training.share)
 
-        outcome = training_run.run(training, state, row, loggers, save, stop, save_first=fresh)
-        if outcome.stopped is not None:
-            save(outcome.state, int(outcome.row["step"][0]))
-            return
-        rates = progress.rates() if self.processes.first else {}
-        self._finish(outcome.state, outcome.row, {"seconds": round(time.monotonic() - begun, 1), **rates})
+        how = FAILED
+        try:
+            outcome = training_run.run(training, state, row, loggers, save, stop, save_first=fresh, film=filmer)
+            if outcome.stopped is not None:
+                save(outcome.state, int(outcome.row["step"][0]))
+                how = STOPPED
+                return
+            rates = progress.rates() if self.processes.first else {}
+            facts = {"seconds": round(time.monotonic() - begun, 1), **rates}
+            self._finish(outcome.state, outcome.row, facts, out)
+            how = FINISHED
+        finally:
+            if out is not None:
+                out.close(how)
 
     def _begin(self) -> tuple[TrainState, Row, bool]:
         """The state to go on from, its row, and whether nothing was trained yet."""
@@ -264,20 +279,22 @@ class Batch:
         updates = self.training.trainer.updates(int(state.rollouts))
         return state, {"step": np.array([done]), "updates": np.array([updates])}, False
 
-    def _finish(self, state: TrainState, row: Row, facts: Mapping[str, Any]) -> None:
+    def _finish(self, state: TrainState, row: Row, facts: Mapping[str, Any], out: Outputs | None) -> None:
         """Leave each run as if it had been trained alone, but for its replay."""
         trainer, share = self.training.trainer, self.training.share
         facts = {**facts, "side_by_side": share.total}
-        for run, config, seeds in zip(self.runs, self.members, self.seeds, strict=True):
+        for number, (run, config, seeds) in enumerate(zip(self.runs, self.members, self.seeds, strict=True)):
             checkpoint.save(run.checkpoints, int(row["step"][0]), trainer, state, keep=1, seeds=seeds, share=share)
-            if not self.processes.first:
+            if out is None:
                 continue
             diverged = {
                 config.seed + place - seeds.start: found
                 for place, found in self.watch.diverged.items()
                 if seeds.start <= place < seeds.stop
             }
-            finish.finish(run, self.training.layout, str(config.name), config.diagnostics.q_bias, facts, diverged)
+            q_bias = config.diagnostics.q_bias
+            found = finish.finish(run, self.training.layout, str(config.name), q_bias, facts, diverged)
+            out.finish(number, found)
 
     def _announce(self) -> None:
         training, config = self.training, self.members[0]

@@ -87,7 +87,7 @@ def of_run(path: Path) -> Condition:
         problems.append(f"{run.path / 'summary.json'} is not whole: a resume makes it anew")
     if not _readable(run.path / "machine.json"):
         problems.append(f"{run.path / 'machine.json'} is missing or not whole: versions and devices are lost")
-    for link in (run.metrics, run.checkpoints, run.tensorboard):
+    for link in run.in_place:
         if link.is_symlink():
             problems.append(f"{link} is a link: a resume writes nothing through it")
     return Condition(run, settings, whole, damaged, table, gaps, lock.holder(run.path), tuple(problems))

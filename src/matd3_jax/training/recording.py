@@ -1,6 +1,7 @@
 """A run that leaves a directory: started, resumed from whatever a stop or a kill left, finished."""
 
 import contextlib
+import dataclasses
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -18,8 +19,11 @@ from matd3_jax.runs.divergence import Divergence
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
-from matd3_jax.training import announcement, checkpoint, finish
-from matd3_jax.training.loggers import DivergenceLogger, Logger, TableLogger, TensorBoardLogger, warn
+from matd3_jax.tracking.messages import FAILED, FINISHED, STOPPED
+from matd3_jax.training import announcement, checkpoint, finish, outputs
+from matd3_jax.training.film import Filmer
+from matd3_jax.training.loggers import CallbackLogger, DivergenceLogger, Logger, TableLogger, warn
+from matd3_jax.training.outputs import Outputs
 from matd3_jax.training.progress import ProgressBar
 from matd3_jax.training.run import Outcome, run
 from matd3_jax.training.session import Row, TrainingSession
@@ -36,6 +40,16 @@ class Recorded(NamedTuple):
     outcome: Outcome
 
 
+@dataclasses.dataclass
+class _Ending:
+    """The loggers of a run, and how they are closed."""
+
+    outputs: Outputs | None
+    """In the first process."""
+    how: str = FAILED
+    """One of `tracking.messages`."""
+
+
 class Recorder:
     """Trains runs whose directories hold their settings, metrics, checkpoints and figures.
 
@@ -45,7 +59,8 @@ class Recorder:
             stay with the program that calls.
         say: gets the lines about a run; None: nothing is said, nor a progress bar shown, but of a seed that diverges a
             RuntimeWarning tells.
-        loggers: get the rows of the metrics table, too.
+        loggers: get the rows of the metrics table, films, figures and the summary, too; their errors end no run.
+        callback: gets the rows; its errors do.
     """
 
     def __init__(
@@ -54,8 +69,9 @@ class Recorder:
         heed_signals: bool = False,
         say: Say | None = None,
         loggers: Sequence[Logger] = (),
+        callback: Callable[[Row], object] | None = None,
     ):
-        self.processes, self.loggers = processes, loggers
+        self.processes, self.loggers, self.callback = processes, loggers, callback
         self.heed_signals = heed_signals
         self.say: Say = say if say is not None and processes.first else lambda line: None
         self.shows_progress = say is not None
@@ -119,8 +135,7 @@ class Recorder:
     def _checked(self, settings: Config, env: Environment | None) -> TrainingSession:
         training = TrainingSession(settings, env, processes=self.processes)
         training.check_memory(recorded=True)
-        if settings.tensorboard:
-            TensorBoardLogger.check()
+        outputs.check(settings)
         return training
 
     def _stop(self) -> Stop | None:
@@ -139,19 +154,37 @@ class Recorder:
         for line in announcement.first_lines(training, directory) if self.processes.first else ():
             self.say(line)
         state, row = training.start()
-        if self.processes.first:
-            directory.append(row)
-            for logger in self.loggers:
-                logger.log(row)
         watch = self._watch(training, {})
         if self.processes.first:
+            directory.append(row)
             watch.log(row)
         return self._to_the_end(training, directory, state, row, stop, watch, fresh=True)
+
+    @property
+    def _tell(self) -> Say:
+        """What gets warnings."""
+        return self.say if self.shows_progress else warn
 
     def _watch(self, training: TrainingSession, diverged: Mapping[int, Divergence]) -> DivergenceLogger:
         """Knows what has diverged so far, given by the numbers of the seeds."""
         known = {seed - training.config.seed: found for seed, found in diverged.items()}
-        return DivergenceLogger(training, self.say if self.shows_progress else warn, known)
+        return DivergenceLogger(training, self._tell, known)
+
+    @contextlib.contextmanager
+    def _outputs(
+        self, training: TrainingSession, directory: RunDirectory, watch: DivergenceLogger
+    ) -> Iterator["_Ending"]:
+        """Loggers for the block, which says how it ends; none in other processes than the first."""
+        ending = _Ending(None)
+        if self.processes.first:
+            seeds = [slice(0, training.share.total)]
+            more = watch.diverged, None, self.loggers
+            ending.outputs = Outputs([directory], [training.config], seeds, self._tell, self.say, *more)
+        try:
+            yield ending
+        finally:
+            if ending.outputs is not None:
+                ending.outputs.close(ending.how)
 
     def _diverged(
         self, training: TrainingSession, directory: RunDirectory, state: TrainState, step: int
@@ -180,7 +213,8 @@ class Recorder:
             if self.processes.first:
                 self.say(f"{directory.path} has come to its end; its figures and its summary are made")
                 self._notes(training, directory, done)
-                self._finish(training, directory, {}, watch)
+                with self._outputs(training, directory, watch) as ending:
+                    self._finish(training, directory, {}, watch, ending)
             return Recorded(directory, training, Outcome(state, row, None, watch.diverged))
         if self.processes.first:
             for line in announcement.first_lines(training, directory, done):
@@ -221,17 +255,36 @@ class Recorder:
         fresh: bool = False,
     ) -> Recorded:
         """Train to the end, or until a signal comes or a seed diverges that must not."""
+        with self._outputs(training, directory, watch) as ending:
+            return self._trained(training, directory, state, row, stop, watch, ending, fresh)
+
+    def _trained(
+        self,
+        training: TrainingSession,
+        directory: RunDirectory,
+        state: TrainState,
+        row: Row,
+        stop: Stop | None,
+        watch: DivergenceLogger,
+        ending: "_Ending",
+        fresh: bool,
+    ) -> Recorded:
         settings, begun = training.config, time.monotonic()
         loggers: list[Logger] = []
-        progress = None
-        if self.processes.first:
+        progress = film = None
+        if ending.outputs is not None:
             loggers = [TableLogger([directory]), watch]
+            others = [CallbackLogger(ending.outputs.log)]  # closed later: the summary is still to come
+            others += [] if self.callback is None else [CallbackLogger(self.callback)]
+            for logger in others if fresh else ():
+                logger.log(row)
             if self.shows_progress:
                 progress = ProgressBar(training, row, watch.diverged)
                 loggers.append(progress)
-            if settings.tensorboard:
-                loggers.append(TensorBoardLogger([directory]))
-            loggers += self.loggers
+            loggers += others
+            if Filmer.wanted([settings]):
+                seeds = [slice(0, len(training.seeds))]
+                film = Filmer(training, [directory], [settings], seeds, self._tell, ending.outputs.attach)
 
         def save(state: TrainState, step: int) -> None:
             keep = settings.keep_checkpoints
@@ -239,23 +292,35 @@ class Recorder:
                 directory.sync()
             checkpoint.save(directory.checkpoints, step, training.trainer, state, keep, share=training.share)
 
-        outcome = run(training, state, row, loggers, save, stop, save_first=fresh)
+        outcome = run(training, state, row, loggers, save, stop, save_first=fresh, film=film)
         step = int(outcome.row["step"][0])
         save(outcome.state, step)
         if self.processes.first:
             if outcome.finished:
                 rates = {} if progress is None else progress.rates()
-                self._finish(training, directory, {"seconds": round(time.monotonic() - begun, 1), **rates}, watch)
+                facts = {"seconds": round(time.monotonic() - begun, 1), **rates}
+                self._finish(training, directory, facts, watch, ending)
             else:
+                ending.how = STOPPED if outcome.stopped is not None else FAILED
                 title, diverged = announcement.title(training), self._by_number(training, watch)
                 finish.draw(directory, training.layout, title, settings.diagnostics.q_bias, diverged)
         return Recorded(directory, training, outcome)
 
-    def _finish(self, training: TrainingSession, directory: RunDirectory, facts: dict, watch: DivergenceLogger) -> None:
+    def _finish(
+        self,
+        training: TrainingSession,
+        directory: RunDirectory,
+        facts: dict,
+        watch: DivergenceLogger,
+        ending: "_Ending",
+    ) -> None:
         title, diverged = announcement.title(training), self._by_number(training, watch)
         found = finish.finish(directory, training.layout, title, training.config.diagnostics.q_bias, facts, diverged)
         for line in announcement.last_lines(training, directory, found, diverged):
             self.say(line)
+        if ending.outputs is not None:
+            ending.outputs.finish(0, found)
+        ending.how = FINISHED
 
     @staticmethod
     def _by_number(training: TrainingSession, watch: DivergenceLogger) -> dict[int, Divergence]:
