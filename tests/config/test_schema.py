@@ -5,13 +5,13 @@ import dataclasses
 import pytest
 
 from matd3_jax import config
-from matd3_jax.config import AlgoConfig, Config, DiagnosticsConfig, schema
+from matd3_jax.config import AlgoConfig, Config, DiagnosticsConfig, MlflowConfig, WandbConfig, schema
 from matd3_jax.config.schema import Affects
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.errors import UserError
 from matd3_jax.sweep import batching
 
-SCHEMAS = (Config, AlgoConfig, DiagnosticsConfig)
+SCHEMAS = (Config, AlgoConfig, DiagnosticsConfig, MlflowConfig, WandbConfig)
 OTHER = {  # another value of each setting of an algorithm
     "name": "other",
     "joint": True,

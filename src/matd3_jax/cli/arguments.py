@@ -176,6 +176,26 @@ class Plot:
 
 
 @dataclasses.dataclass(frozen=True)
+class Report:
+    """Write one HTML page about runs: final returns with intervals and differences, learning curves, films, settings,
+    machines, and the commands that train them again.
+
+    The page needs nothing but itself: pictures and films are in it, and no scripts. Runs whose settings differ only in
+    their seeds are one line; those that have not ended are shown as far as they are.
+    """
+
+    runs: tuple[Path, ...] = option(
+        "run directories; also [A,B], and patterns: runs='runs/sweep/*'", metavar="A,B", read=paths
+    )
+    out: Path = option("a name that ends with .html", default=Path("report.html"), new_file=True)
+    title: str | None = option("of the page", default=None, otherwise="what all runs have in common")
+    films: str = option(
+        "auto: those that there are, and of particle tasks others are made; found: those that there are",
+        default="auto", choices=("auto", "found", "none"),
+    )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
 class Check:
     """Say what a run directory holds, what of it is damaged, and how to go on with it. Changes nothing.
 
@@ -246,6 +266,9 @@ PLOT = Command(
     _python("plot"), Plot,
     examples=("python -m matd3_jax.plot runs='runs/sweep/runs/*' y=return_agents,eval_return_agents average=iqm",),
 )  # fmt: skip
+REPORT = Command(
+    _python("report"), Report, examples=("python -m matd3_jax.report runs='runs/sweep/runs/*' out=sweep.html",)
+)
 CHECK = Command(
     _python("check"), Check, usage=("run=RUN_DIR", "sweep=SWEEP_DIR"),
     examples=("python -m matd3_jax.check run=runs/first", "python -m matd3_jax.check sweep=runs/sweep"),
@@ -258,5 +281,6 @@ COMMANDS: dict[str, Command] = {
     "crossplay": CROSSPLAY,
     "plot": PLOT,
     "render": RENDER,
+    "report": REPORT,
     "check": CHECK,
 }

@@ -13,6 +13,7 @@ COMMANDS = {
     "crossplay": "play every run's agents against every run's adversaries",
     "plot": "draw learning curves of runs",
     "render": "make a film of an episode",
+    "report": "write a page about runs",
     "check": "say what a run directory holds and what is damaged",
 }
 
