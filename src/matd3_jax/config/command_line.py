@@ -1,5 +1,6 @@
 """The shortest command line that gives settings again."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,7 +11,8 @@ from matd3_jax.errors import UserError
 
 
 def overrides(config: Config) -> list[str] | None:
-    """What `load` makes these settings of: files, and the values that differ from theirs.
+    """What `load` makes these settings of: files, and the values that differ from theirs; without the run's name and
+    place (`TEXTS`), which are taken.
 
     None where no command line does: an environment that was given as an object, say.
     """
@@ -21,9 +23,10 @@ def overrides(config: Config) -> list[str] | None:
             names.append(f"recipe={config.recipe}")
         base = _flat(load(names).to_dict())
         wanted = _flat(config.to_dict())
-        values = [_line(key, value) for key, value in wanted.items() if base.get(key, _ABSENT) != value]
-        found = [*names, *values]
-        return found if load(found) == config else None
+        other = {key: value for key, value in wanted.items() if base.get(key, _ABSENT) != value and key not in TEXTS}
+        found = [*names, *(_line(key, value) for key, value in other.items())]
+        same = dataclasses.replace(load(found), **{key: getattr(config, key) for key in TEXTS})
+        return found if same == config else None
     except (UserError, KeyError):
         return None
 
@@ -32,8 +35,6 @@ _ABSENT = object()
 
 
 def _line(key: str, value: Any) -> str:
-    if key in TEXTS:
-        return f"{key}={value}"
     if isinstance(value, str) and not value.replace("_", "").isalnum():
         escaped = value.replace("\\", "\\\\").replace("'", "\\'")
         return f"{key}='{escaped}'"

@@ -40,7 +40,7 @@ def write(settings: Sequence[Setting], pictures: Pictures, title: str, made: str
         ("diverged", "Seeds that diverged", sections.diverged(settings)),
         ("differences", "Differences", sections.pairwise(settings)),
         ("curves", "Learning curves", sections.curves(settings, pictures.figures)),
-        ("films", "Films", sections.films(pictures.films, pictures.without)),
+        ("films", "Films", sections.films(settings, pictures.films, pictures.without)),
         ("settings", "What differs", sections.differing(settings)),
         ("all-settings", "All settings", sections.all_settings(runs)),
         ("runs", "Runs", sections.runs(settings)),

@@ -13,6 +13,7 @@ from matd3_jax.reporting import facts
 from matd3_jax.reporting.facts import Run, Setting
 from matd3_jax.reporting.html import Markup, data_uri, join, number, table, tag
 from matd3_jax.stats import text
+from matd3_jax.stats.intervals import Estimate
 
 SWATCH = (0, 5, 30)
 """Begin, middle and end of a line in the legend."""
@@ -45,21 +46,21 @@ def final_returns(settings: Sequence[Setting]) -> Markup:
         row: list[str | Markup] = [join(swatch(k), one.label), _seeds(one), number(f"{one.end:,.0f}", one.end)]
         for name in names:
             found = one.estimate(name)
-            if found is None:
-                row += [number(text.NOTHING), number(text.NOTHING)]
-            else:
-                low, high = float(found.low), float(found.high)
-                band = text.NOTHING if np.isnan(low) else text.ends(low, high)
-                row += [number(text.number(float(found.value)), float(found.value)), number(band)]
+            row.append(number(text.NOTHING) if found is None else _with_interval(found))
         rows.append(row)
-    heads: list[str | Markup] = ["setting", "seeds", "env steps"]
-    for name in names:
-        heads += [words(name), "95 % interval"]
+    heads: list[str | Markup] = ["setting", "seeds", "env steps", *map(words, names)]
     note = (
         "Training: mean undiscounted return over the last tenth of the run, exploration included. Evaluation: the last "
-        "one, without exploration. Means over seeds with Student's t interval; seeds that diverged are left out."
+        "one, without exploration. Means over seeds, below them the ends of their 95 % intervals (Student's t); seeds "
+        "that diverged are left out."
     )
     return join(table(heads, rows, class_="returns"), tag("p", note, class_="faint"))
+
+
+def _with_interval(found: Estimate) -> Markup:
+    value, low, high = (float(part) for part in found)
+    band = None if np.isnan(low) else tag("small", text.ends(low, high), data_low=repr(low), data_high=repr(high))
+    return tag("td", text.number(value), band, class_="number", data_value=repr(value))
 
 
 def _seeds(one: Setting) -> Markup:
@@ -80,9 +81,8 @@ def diverged(settings: Sequence[Setting]) -> Markup | None:
 
 def pairwise(settings: Sequence[Setting]) -> Markup | None:
     """Differences of final returns; None where there is nothing to compare."""
-    parts: list[Markup] = []
+    rows: list[list[str | Markup]] = []
     for name in facts.columns(settings):
-        rows: list[list[str | Markup]] = []
         for one in facts.differences(settings, name):
             found = one.found
             difference, low, high, p = (float(part) for part in (found.difference, found.low, found.high, found.p))
@@ -91,10 +91,8 @@ def pairwise(settings: Sequence[Setting]) -> Markup | None:
             shown = text.number(difference)
             marked = tag("td", shown, class_="number clear" if bool(found.clear) else "number",
                          data_value=repr(difference))  # fmt: skip
-            rows.append([f"{one.a.label} minus {one.b.label}", marked, number(band), number(chance)])
-        if rows:
-            parts += [tag("h3", words(name)), table(["", "difference", "95 % interval", "p"], rows, class_="pairs")]
-    if not parts:
+            rows.append([f"{one.a.label} minus {one.b.label}", words(name), marked, number(band), number(chance, p)])
+    if not rows:
         return None
     note = (
         "Welch's t-test of the seeds' values; bold where the interval leaves zero out. Of many comparisons some 5 % do "
@@ -102,7 +100,8 @@ def pairwise(settings: Sequence[Setting]) -> Markup | None:
     )
     if len(settings) > facts.ALL_PAIRS:
         note += " The best setting is compared with each other one."
-    return join(*parts, tag("p", note, class_="faint"))
+    heads: list[str | Markup] = ["settings", "return", "difference", "95 % interval", "p"]
+    return join(table(heads, rows, class_="pairs"), tag("p", note, class_="faint"))
 
 
 def curves(settings: Sequence[Setting], figures: Sequence[tuple[str, Path, Path]]) -> Markup | None:
@@ -186,21 +185,22 @@ def _quantity(summary: Mapping[str, Any], key: str, form: str) -> Markup:
     return number(shown, float(value))
 
 
-def films(found: Mapping[str, Path], left_out: Mapping[str, str]) -> Markup | None:
+def films(settings: Sequence[Setting], found: Mapping[str, Path], left_out: Mapping[str, str]) -> Markup | None:
     """A film of each run.
 
     Args:
-        found: files by the names of the runs.
+        found: files by the names of the runs, in their order.
         left_out: why a run has none, by its name.
     """
     shown = []
-    for name, path in found.items():
+    labels = [one.label for one in settings for run in one.runs if run.name in found]
+    for (name, path), label in zip(found.items(), labels, strict=True):
         uri = data_uri(path)
         if path.suffix == ".mp4":
             film = tag("video", src=uri, controls=True, loop=True, muted=True, playsinline=True, preload="metadata")
         else:
             film = tag("img", src=uri, alt=f"an episode of {name}")
-        shown.append(tag("figure", film, tag("figcaption", name)))
+        shown.append(tag("figure", film, tag("figcaption", f"{name} ({label})")))
     notes = [tag("li", f"{name}: {why}") for name, why in left_out.items()]
     if not shown and not notes:
         return None

@@ -18,9 +18,10 @@ p { margin: 0.4rem 0; }
 table { border-collapse: collapse; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
 th, td { padding: 0.3rem 0.7rem; border-bottom: 1px solid var(--line); text-align: left; vertical-align: top;
   overflow-wrap: normal; }
-tbody th { font-weight: normal; max-width: 24rem; overflow-wrap: anywhere; }
+tbody th { font-weight: normal; min-width: 8rem; max-width: 24rem; overflow-wrap: break-word; }
 thead th { font-weight: 600; white-space: nowrap; }
 td.number { text-align: right; white-space: nowrap; }
+td small { display: block; color: var(--faint); font-size: 0.85em; }
 .clear { font-weight: 600; }
 .warning { color: #b3401a; }
 @media (prefers-color-scheme: dark) { .warning { color: #ff9a6b; } }
