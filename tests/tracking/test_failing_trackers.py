@@ -54,7 +54,7 @@ def started(tmp_path, said, told):
     [
         ({"init": "raise RuntimeError('No API key configured.')"}, "RuntimeError: No API key configured."),
         ({"init": "raise SystemExit(1)"}, "its process ended (exit code 1)"),
-        ({"log": "raise ValueError('two\\\\nlines')"}, "ValueError: two lines"),
+        ({"log": "raise ValueError('two\\nlines')"}, "ValueError: two lines"),
         ({"log": "os._exit(7)"}, "its process ended (exit code 7)"),
         ({"close": "raise OSError('no network')"}, "OSError: no network"),
     ],

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 import matd3_jax
+from matd3_jax import config
 from matd3_jax.envs.point_reach import PointReach
 from matd3_jax.errors import UserError
 from matd3_jax.runs.directory import RunDirectory
@@ -54,16 +55,16 @@ def filmed(tmp_path_factory, quick_jit) -> tuple[Path, Noted, list[str]]:
 
 def test_a_film_at_each_interval_that_passes_a_multiple(filmed):
     path, _, _ = filmed
-    assert sorted(int(found.stem) for found in (path / "videos").iterdir()) == [300, 500]
-    with Image.open(path / "videos" / "300.gif") as film:
+    assert sorted(int(found.stem) for found in (path / "videos").iterdir()) == [250, 550]
+    with Image.open(path / "videos" / "250.gif") as film:
         assert film.n_frames <= PICTURES + 2 and max(film.size) == SIZE
 
 
 def test_a_logger_gets_rows_films_figures_and_the_summary_though_it_failed(filmed):
     path, noted, told = filmed
-    assert noted.rows == [100, 200, 300, 400, 500, 600] and noted.closed == 1
-    assert noted.files == [(300, "300.gif", 3), (500, "500.gif", 3), (600, "learning_curve.png", None)]
-    assert noted.found is not None and noted.found["total_steps"] == 600
+    assert noted.rows == [50, 150, 250, 350, 450, 550, 650] and noted.closed == 1
+    assert noted.files == [(250, "250.gif", 3), (550, "550.gif", 3), (650, "learning_curve.png", None)]
+    assert noted.found is not None and noted.found["total_steps"] == 650
     assert told == ["warning: Noted fails, the run goes on: ValueError: the first row"]
 
 
@@ -101,7 +102,7 @@ class Parts:
 
 
 def test_the_first_sound_seed_plays(tmp_path, monkeypatch):
-    settings = matd3_jax.train.__globals__["configuration"].load(["env=point_reach", "seeds=3", "video_every=10"])
+    settings = config.load(["env=point_reach", "seeds=3", "video_every=10"])
     got, run = [], RunDirectory(tmp_path)
     filmer = Filmer(Parts(), [run], [settings], [slice(0, 3)], got.append, lambda *given: got.append(given))
     monkeypatch.setattr(filmer, "_film", lambda run, state, seed, step: tmp_path / f"{step}.gif")
@@ -118,7 +119,7 @@ def test_without_opengl_one_warning(tmp_path, monkeypatch):
 
     monkeypatch.setattr(opengl, "context_class", none)
     monkeypatch.setattr(frames, "drawing_of", lambda env: mujoco_renderer.RobotDrawing(env))
-    settings = matd3_jax.train.__globals__["configuration"].load(["env=point_reach", "seeds=3", "video_every=10"])
+    settings = config.load(["env=point_reach", "seeds=3", "video_every=10"])
     told = []
     filmer = Filmer(Parts(), [RunDirectory(tmp_path)], [settings], [slice(0, 3)], told.append, lambda *given: None)
     for step in (10, 20, 30):
@@ -128,8 +129,6 @@ def test_without_opengl_one_warning(tmp_path, monkeypatch):
 
 
 def test_runs_of_a_sweep_are_filmed_each_by_its_own_setting(tmp_path, quick_jit):
-    from matd3_jax import config
-
     given = [f"{key}={value}" for key, value in {**SMALL, "seeds": 1}.items()]
     settings = {
         name: config.load(["env=point_reach", "algo.hidden=[8]", f"algo.lr={rate}", f"video_every={every}", *given])
@@ -137,4 +136,4 @@ def test_runs_of_a_sweep_are_filmed_each_by_its_own_setting(tmp_path, quick_jit)
     }
     runs = runner.train(settings, tmp_path / "sweep")
     assert not (runs["a"][0] / "videos").exists()
-    assert [path.name for path in (runs["b"][0] / "videos").iterdir()] == ["600.gif"]
+    assert [path.name for path in (runs["b"][0] / "videos").iterdir()] == ["650.gif"]

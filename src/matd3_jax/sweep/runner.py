@@ -24,7 +24,7 @@ from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.runtime.terminal import say
 from matd3_jax.sweep import batching
-from matd3_jax.tracking.messages import FAILED, FINISHED, STOPPED
+from matd3_jax.tracking.messages import FINISHED, STOPPED
 from matd3_jax.training import checkpoint, film, finish, outputs
 from matd3_jax.training import run as training_run
 from matd3_jax.training.film import Filmer
@@ -219,11 +219,20 @@ class Batch:
         if self.processes.first:
             self._announce()
         state, row, fresh = self._begin()
+        with self._outputs() as out:
+            self._train(stop, state, row, fresh, begun, out)
+
+    def _outputs(self) -> Outputs:
+        """Where rows go besides the directories; nowhere from other processes than the first."""
+        there = slice(None) if self.processes.first else slice(0)
+        parts = self.runs[there], self.members[there], self.seeds[there]
+        return Outputs(*parts, say, say, self.watch.diverged, self.sweep.folder.absolute().name)
+
+    def _train(self, stop: Stop, state: TrainState, row: Row, fresh: bool, begun: float, out: Outputs) -> None:
+        training = self.training
         loggers: list[Logger] = []
-        out = filmer = None
+        filmer = None
         if self.processes.first:
-            name = self.sweep.folder.absolute().name
-            out = Outputs(self.runs, self.members, self.seeds, say, say, self.watch.diverged, name)
             if fresh:
                 out.log(row)
             progress = ProgressBar(training, row, self.watch.diverged)
@@ -236,20 +245,14 @@ class Batch:
                 run.sync()
             checkpoint.save(self.checkpoints, step, training.trainer, state, keep=1, share=training.share)
 
-        how = FAILED
-        try:
-            outcome = training_run.run(training, state, row, loggers, save, stop, save_first=fresh, film=filmer)
-            if outcome.stopped is not None:
-                save(outcome.state, int(outcome.row["step"][0]))
-                how = STOPPED
-                return
-            rates = progress.rates() if self.processes.first else {}
-            facts = {"seconds": round(time.monotonic() - begun, 1), **rates}
-            self._finish(outcome.state, outcome.row, facts, out)
-            how = FINISHED
-        finally:
-            if out is not None:
-                out.close(how)
+        outcome = training_run.run(training, state, row, loggers, save, stop, save_first=fresh, film=filmer)
+        if outcome.stopped is not None:
+            save(outcome.state, int(outcome.row["step"][0]))
+            out.how = STOPPED
+            return
+        rates = progress.rates() if self.processes.first else {}
+        self._finish(outcome.state, outcome.row, {"seconds": round(time.monotonic() - begun, 1), **rates}, out)
+        out.how = FINISHED
 
     def _begin(self) -> tuple[TrainState, Row, bool]:
         """The state to go on from, its row, and whether nothing was trained yet."""
@@ -279,13 +282,13 @@ class Batch:
         updates = self.training.trainer.updates(int(state.rollouts))
         return state, {"step": np.array([done]), "updates": np.array([updates])}, False
 
-    def _finish(self, state: TrainState, row: Row, facts: Mapping[str, Any], out: Outputs | None) -> None:
+    def _finish(self, state: TrainState, row: Row, facts: Mapping[str, Any], out: Outputs) -> None:
         """Leave each run as if it had been trained alone, but for its replay."""
         trainer, share = self.training.trainer, self.training.share
         facts = {**facts, "side_by_side": share.total}
         for number, (run, config, seeds) in enumerate(zip(self.runs, self.members, self.seeds, strict=True)):
             checkpoint.save(run.checkpoints, int(row["step"][0]), trainer, state, keep=1, seeds=seeds, share=share)
-            if out is None:
+            if not self.processes.first:
                 continue
             diverged = {
                 config.seed + place - seeds.start: found

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,7 @@ class TrackingLogger:
     ):
         self.kind, self.tell, self.say = kind, tell, say
         self.warned = self.closed = self._gone = False
+        self._deadline: float | None = None
         self._said: collections.deque[tuple[str, str]] = collections.deque()
         self._queue: queue.Queue[Any] = queue.Queue(MOST)
         package = str(Path(matd3_jax.__file__).parents[1])
@@ -100,22 +102,28 @@ class TrackingLogger:
         """Take what a run left in its summary."""
         self._send(message)
 
+    def end(self, how: str = FINISHED) -> None:
+        """Tell the tracker that nothing will come any more; `close` waits for it."""
+        if self._deadline is None:
+            self.patience = PATIENCE.get(how, IN_A_HURRY)
+            self._deadline = time.monotonic() + self.patience
+            self._send(Closed(how))
+
     def close(self, how: str = FINISHED) -> None:
         """End the tracker's runs; wait until it has taken everything, but not for ever."""
         if self.closed or self._process is None:
             return
         self.closed = True
-        self._send(Closed(how))
-        seconds = PATIENCE.get(how, IN_A_HURRY)
+        self.end(how)
         try:
-            self._process.wait(seconds)
+            self._process.wait(max(0.1, self._deadline - time.monotonic()))  # type: ignore[operator]
         except BaseException as error:
             with contextlib.suppress(OSError):
                 os.killpg(self._process.pid, signal.SIGKILL)  # with what it started
             self._process.wait()
             if not isinstance(error, subprocess.TimeoutExpired):
                 raise
-            self._said.append(("warning", f"it has not taken everything after {seconds:.0f} s"))
+            self._said.append(("warning", f"it has not taken everything after {self.patience:.0f} s"))
         self._threads[1].join(1)
         self._tell()
 

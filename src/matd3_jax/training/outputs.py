@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from matd3_jax.runs import summary
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.tracking import logger as tracking
 from matd3_jax.tracking import messages
-from matd3_jax.tracking.messages import FINISHED, Summarized, TrackedRun
+from matd3_jax.tracking.messages import FAILED, Summarized, TrackedRun
 from matd3_jax.training.loggers import Logger, TensorBoardLogger
 from matd3_jax.training.session import Row
 
@@ -72,6 +72,8 @@ class Harmless:
 class Outputs:
     """Where the rows, films, figures and summaries of runs side by side go, besides their directories.
 
+    As a context it is closed at the end; `how` says before how the runs were left.
+
     Args:
         members: settings of the runs, and `seeds` where each run's seeds are in the rows.
         tell: gets warnings.
@@ -93,6 +95,8 @@ class Outputs:
         own: Sequence[Logger] = (),
     ):
         self.runs = runs
+        self.how = FAILED
+        """What trackers are told at the end, one of `tracking.messages`."""
         self.own = [Harmless(logger, tell) for logger in own]
         # Runs of one program may have different loggers.
         board = [
@@ -132,12 +136,20 @@ class Outputs:
         for tracker in self.trackers:
             tracker.summarize(run, _summarized(directory, step, found))
 
-    def close(self, how: str = FINISHED) -> None:
-        """End; trackers may take a while to get everything, but not for ever. how: one of `tracking.messages`."""
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End; trackers may take a while to get everything, but not for ever."""
         for logger in self.own:
             logger.close()
         for tracker in self.trackers:
-            tracker.logger.close(how)
+            tracker.logger.end(self.how)
+        for tracker in self.trackers:
+            tracker.logger.close(self.how)
 
 
 class Tracker:

@@ -1,7 +1,6 @@
 """A run that leaves a directory: started, resumed from whatever a stop or a kill left, finished."""
 
 import contextlib
-import dataclasses
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -38,16 +37,6 @@ class Recorded(NamedTuple):
     directory: RunDirectory
     training: TrainingSession
     outcome: Outcome
-
-
-@dataclasses.dataclass
-class _Ending:
-    """The loggers of a run, and how they are closed."""
-
-    outputs: Outputs | None
-    """In the first process."""
-    how: str = FAILED
-    """One of `tracking.messages`."""
 
 
 class Recorder:
@@ -170,21 +159,11 @@ class Recorder:
         known = {seed - training.config.seed: found for seed, found in diverged.items()}
         return DivergenceLogger(training, self._tell, known)
 
-    @contextlib.contextmanager
-    def _outputs(
-        self, training: TrainingSession, directory: RunDirectory, watch: DivergenceLogger
-    ) -> Iterator["_Ending"]:
-        """Loggers for the block, which says how it ends; none in other processes than the first."""
-        ending = _Ending(None)
-        if self.processes.first:
-            seeds = [slice(0, training.share.total)]
-            more = watch.diverged, None, self.loggers
-            ending.outputs = Outputs([directory], [training.config], seeds, self._tell, self.say, *more)
-        try:
-            yield ending
-        finally:
-            if ending.outputs is not None:
-                ending.outputs.close(ending.how)
+    def _outputs(self, training: TrainingSession, directory: RunDirectory, watch: DivergenceLogger) -> Outputs:
+        """The loggers beside the run's directory; none in other processes than the first."""
+        seeds, first = [slice(0, training.share.total)], self.processes.first
+        runs, members, own = ([directory], [training.config], self.loggers) if first else ([], [], ())
+        return Outputs(runs, members, seeds[: len(runs)], self._tell, self.say, watch.diverged, own=own)
 
     def _diverged(
         self, training: TrainingSession, directory: RunDirectory, state: TrainState, step: int
@@ -213,8 +192,8 @@ class Recorder:
             if self.processes.first:
                 self.say(f"{directory.path} has come to its end; its figures and its summary are made")
                 self._notes(training, directory, done)
-                with self._outputs(training, directory, watch) as ending:
-                    self._finish(training, directory, {}, watch, ending)
+                with self._outputs(training, directory, watch) as out:
+                    self._finish(training, directory, {}, watch, out)
             return Recorded(directory, training, Outcome(state, row, None, watch.diverged))
         if self.processes.first:
             for line in announcement.first_lines(training, directory, done):
@@ -255,8 +234,8 @@ class Recorder:
         fresh: bool = False,
     ) -> Recorded:
         """Train to the end, or until a signal comes or a seed diverges that must not."""
-        with self._outputs(training, directory, watch) as ending:
-            return self._trained(training, directory, state, row, stop, watch, ending, fresh)
+        with self._outputs(training, directory, watch) as out:
+            return self._trained(training, directory, state, row, stop, watch, fresh, out)
 
     def _trained(
         self,
@@ -266,15 +245,15 @@ class Recorder:
         row: Row,
         stop: Stop | None,
         watch: DivergenceLogger,
-        ending: "_Ending",
         fresh: bool,
+        out: Outputs,
     ) -> Recorded:
         settings, begun = training.config, time.monotonic()
         loggers: list[Logger] = []
         progress = film = None
-        if ending.outputs is not None:
+        if self.processes.first:
             loggers = [TableLogger([directory]), watch]
-            others = [CallbackLogger(ending.outputs.log)]  # closed later: the summary is still to come
+            others = [CallbackLogger(out.log)]  # closed later: the summary is still to come
             others += [] if self.callback is None else [CallbackLogger(self.callback)]
             for logger in others if fresh else ():
                 logger.log(row)
@@ -284,7 +263,7 @@ class Recorder:
             loggers += others
             if Filmer.wanted([settings]):
                 seeds = [slice(0, len(training.seeds))]
-                film = Filmer(training, [directory], [settings], seeds, self._tell, ending.outputs.attach)
+                film = Filmer(training, [directory], [settings], seeds, self._tell, out.attach)
 
         def save(state: TrainState, step: int) -> None:
             keep = settings.keep_checkpoints
@@ -299,9 +278,9 @@ class Recorder:
             if outcome.finished:
                 rates = {} if progress is None else progress.rates()
                 facts = {"seconds": round(time.monotonic() - begun, 1), **rates}
-                self._finish(training, directory, facts, watch, ending)
+                self._finish(training, directory, facts, watch, out)
             else:
-                ending.how = STOPPED if outcome.stopped is not None else FAILED
+                out.how = STOPPED if outcome.stopped is not None else FAILED
                 title, diverged = announcement.title(training), self._by_number(training, watch)
                 finish.draw(directory, training.layout, title, settings.diagnostics.q_bias, diverged)
         return Recorded(directory, training, outcome)
@@ -312,15 +291,14 @@ class Recorder:
         directory: RunDirectory,
         facts: dict,
         watch: DivergenceLogger,
-        ending: "_Ending",
+        out: Outputs,
     ) -> None:
         title, diverged = announcement.title(training), self._by_number(training, watch)
         found = finish.finish(directory, training.layout, title, training.config.diagnostics.q_bias, facts, diverged)
         for line in announcement.last_lines(training, directory, found, diverged):
             self.say(line)
-        if ending.outputs is not None:
-            ending.outputs.finish(0, found)
-        ending.how = FINISHED
+        out.finish(0, found)
+        out.how = FINISHED
 
     @staticmethod
     def _by_number(training: TrainingSession, watch: DivergenceLogger) -> dict[int, Divergence]:
