@@ -23,7 +23,7 @@ def tag(name: str, /, *children: "str | Markup | None", **attributes: object) ->
         if value is None or value is False:
             continue
         key = key.rstrip("_").replace("_", "-")
-        given.append(f" {key}" if value is True else f' {key}="{html.escape(str(value), quote=True)}"')
+        given.append(f" {key}" if value is True else f' {key}="{escape(str(value))}"')
     opened = f"<{name}{''.join(given)}>"
     return Markup(opened if name in VOID else f"{opened}{join(*children)}</{name}>")
 

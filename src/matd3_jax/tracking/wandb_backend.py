@@ -56,7 +56,8 @@ class WandbBackend:
         first = next(iter(self.runs.values()))
         if first.offline:
             return "Weights & Biases: offline; each run directory's wandb/ has files to be uploaded with: wandb sync"
-        return f"Weights & Biases: {first.url}" + (f" and {len(self.runs) - 1} more" if len(self.runs) > 1 else "")
+        more = f" and {len(self.runs) - 1} more" if len(self.runs) > 1 else ""
+        return f"Weights & Biases: {first.url}{more}" if first.url else "Weights & Biases: disabled"
 
     def log(self, key: tuple[int, int | None], step: int, values: Numbers) -> None:
         self.runs[key].log(values, step=step)
