@@ -119,7 +119,8 @@ def key_values(keys: Mapping[str, str], settings: Mapping[str, Any]) -> dict[str
 def differences(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     """Settings that differ and matter, by name: (found, wanted)."""
     a, b = _flat(found), _flat(wanted)
-    return {key: (a[key], b[key]) for key in a if key in b and a[key] != b[key] and key not in UNREPORTED}
+    shared = (key for key in a if key in b and key.split(".")[0] not in UNREPORTED)
+    return {key: (a[key], b[key]) for key in shared if a[key] != b[key]}
 
 
 def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -82,7 +82,7 @@ def test_packages_import_what_they_may(name):
 
 def test_nothing_imports_the_commands():
     """But for the modules that `python -m` runs."""
-    run = {"train", "sweep.__main__", "evaluate", "crossplay", "plot", "render", "check", "export.__main__"}
+    run = {"train", "sweep.__main__", "evaluate", "crossplay", "plot", "render", "report", "check", "export.__main__"}
     wrong = {m for m, path in MODULES.items() if any(package(o) == "cli" for o in ours(path)) and package(m) != "cli"}
     assert wrong == run
 

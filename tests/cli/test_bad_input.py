@@ -17,7 +17,7 @@ import benchmarks
 import experiments
 from matd3_jax.cli import arguments, command
 from matd3_jax.cli.options import Command
-from matd3_jax.config.schema import AlgoConfig, Config, DiagnosticsConfig
+from matd3_jax.config.schema import AlgoConfig, Config, DiagnosticsConfig, MlflowConfig, WandbConfig
 from matd3_jax.runs.directory import RunDirectory
 
 SECONDS = 5
@@ -124,7 +124,7 @@ def test_options_of_benchmarks_and_experiments(capsys):
 def of_schema(cls: type, prefix: str) -> Iterator[tuple[str, str]]:
     hints = typing.get_type_hints(cls)
     for field in dataclasses.fields(cls):
-        if field.name in ("env", "algo", "adversary", "diagnostics") and cls is Config:
+        if field.name in ("env", "algo", "adversary", "diagnostics", "wandb", "mlflow") and cls is Config:
             yield from ((field.name, text) for text in ("", "3", "[a]", "{a:1}", "nan", "x", bad_input.LONG))
         elif not field.metadata["text"] and not (prefix and field.name == "name"):
             key = prefix + field.name
@@ -136,6 +136,8 @@ GROUPS = {
     "algo.": (AlgoConfig, []),
     "adversary.": (AlgoConfig, ["env=simple_tag", "adversary=maddpg"]),
     "diagnostics.": (DiagnosticsConfig, ["diagnostics.q_bias=true"]),
+    "wandb.": (WandbConfig, []),
+    "mlflow.": (MlflowConfig, []),
 }
 
 

@@ -244,7 +244,7 @@ def test_a_missing_checksum_file_is_damage(whole, tmp_path):
 
 
 def test_tensorboard_files_hold_the_table(whole, tmp_path):
-    assert run(tmp_path, "name=tb", "tensorboard=true") == 0
+    assert run(tmp_path, "name=tb", "logger=[csv,tensorboard]") == 0
     events = list((tmp_path / "tb" / "tensorboard").glob("events*"))
     assert len(events) == 1 and b"return_agents/seed_2" in events[0].read_bytes()
 
@@ -321,7 +321,7 @@ def test_bad_input_to_train_writes_nothing(case, whole, monkeypatch):
 
 
 CANNOT = {
-    "a missing package": (["tensorboard=true"], "needs tensorboardX"),
+    "a missing package": (["logger=[csv,tensorboard]"], "needs the package tensorboardX"),
     "memory": (["replay_capacity=100000000", "total_steps=100000000"], "GB are free"),
     "a file in the way": (["out={out}/file"], "cannot make this directory"),
     "a name too long": (["name=" + 300 * "a"], "File name too long"),

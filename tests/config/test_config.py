@@ -242,3 +242,23 @@ def test_a_short_run_allocates_no_rows_it_would_never_write():
     training = TrainingSession(config.load(["seeds=2", "total_steps=100000"]))
     assert training.trainer.schedule.replay_capacity == training.total_steps < 101_000
     assert training.trainer.replay_bytes == 2 * training.total_steps * 127 * 4
+
+
+@pytest.mark.parametrize(("before", "now"), [(True, ("csv", "tensorboard")), (False, ("csv",))])
+def test_loggers_of_a_run_from_before_the_list(before, now, tmp_path):
+    """It had `tensorboard`; who writes that is told of the list."""
+    old = config.load().to_dict()
+    for key in ("logger", "logger_seeds", "wandb", "mlflow", "video_every"):
+        del old[key]
+    (tmp_path / "config.yaml").write_text(json.dumps({**old, "tensorboard": before}))
+    assert config.read(tmp_path / "config.yaml") == dataclasses.replace(config.load(), logger=now)
+    with pytest.raises(UserError, match=r"no key 'tensorboard'; it is logger=\[csv,tensorboard\] now"):
+        config.load(["tensorboard=true"])
+
+
+@pytest.mark.parametrize(
+    ("given", "found"),
+    [("[]", "csv"), ("wandb", "csv,wandb"), ("[mlflow,wandb,mlflow]", "csv,wandb,mlflow"), ("[csv]", "csv")],
+)
+def test_the_table_is_always_among_the_loggers(given, found):
+    assert ",".join(config.load([f"logger={given}"]).logger) == found

@@ -5,13 +5,13 @@ import dataclasses
 import pytest
 
 from matd3_jax import config
-from matd3_jax.config import AlgoConfig, Config, DiagnosticsConfig, schema
+from matd3_jax.config import AlgoConfig, Config, DiagnosticsConfig, MlflowConfig, WandbConfig, schema
 from matd3_jax.config.schema import Affects
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.errors import UserError
 from matd3_jax.sweep import batching
 
-SCHEMAS = (Config, AlgoConfig, DiagnosticsConfig)
+SCHEMAS = (Config, AlgoConfig, DiagnosticsConfig, MlflowConfig, WandbConfig)
 OTHER = {  # another value of each setting of an algorithm
     "name": "other",
     "joint": True,
@@ -61,7 +61,11 @@ def test_programs_are_split_by_shapes_and_by_what_their_interval_does():
         "checkpoint_every": 1,
         "checkpoint_minutes": 3.0,
         "keep_checkpoints": 9,
-        "tensorboard": True,
+        "logger": ("csv", "wandb"),
+        "logger_seeds": "bands",
+        "wandb": config.WandbConfig("project", None, "offline"),
+        "mlflow": config.MlflowConfig(None, "experiment"),
+        "video_every": 5,
         "on_divergence": "stop",
     }
     assert set(alike) == set(schema.UNSHARED)
@@ -73,7 +77,8 @@ def test_programs_are_split_by_shapes_and_by_what_their_interval_does():
 def test_lists_that_follow_from_the_fields():
     assert set(schema.RECORDS) == {
         "total_steps", "name", "out", "log_every", "eval_every", "eval_episodes", "diagnostics", "checkpoint_every",
-        "checkpoint_minutes", "keep_checkpoints", "tensorboard", "on_divergence",
+        "checkpoint_minutes", "keep_checkpoints", "logger", "logger_seeds", "wandb", "mlflow", "video_every",
+        "on_divergence",
     }  # fmt: skip
     # What a table says of a seed depends on how long the run was and how it was evaluated.
     reported = {"total_steps", "eval_every", "eval_episodes", "diagnostics"}

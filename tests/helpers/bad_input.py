@@ -69,7 +69,8 @@ def settings(hint: Any, bounds: Bounds) -> Iterator[str]:
         elif kind is bool:
             yield from ("", "x", "2", "[true]", "{a:true}", "\u00e9", "nan", LONG, "${x}", "'true'")
         elif kind is str:
-            yield from ("[a]", "{a:1}", "1", "nan", "true", "\u00e9\u00e9", LONG, "${x}")
+            yield from ("[a]", "{a:1}", "1", "nan", "true", "${x}")
+            yield from ("\u00e9\u00e9", LONG) if bounds.choices is not None else ()
         elif typing.get_origin(kind) is tuple:
             yield from ("x", "{a:1}", "[x]", "[[1]]", "[{a:1}]", "[nan]", "[inf]", "[null]", "[\u00e9]", "[true]", LONG)
             if typing.get_args(kind)[-1] is Ellipsis:

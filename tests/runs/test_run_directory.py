@@ -62,7 +62,7 @@ def test_what_killed_writes_left_is_removed_and_nothing_else(run):
     assert {path.name for path in run.path.iterdir()} == {*kept, "config.yaml", "machine.json"}
 
 
-@pytest.mark.parametrize("name", ["metrics.csv", "checkpoints", "tensorboard"])
+@pytest.mark.parametrize("name", ["metrics.csv", "checkpoints", "tensorboard", "videos", "wandb"])
 def test_links_are_not_written_through(run, name, tmp_path):
     (run.path / name).symlink_to(tmp_path / "elsewhere")
     with pytest.raises(UserError, match="is a link: nothing is written through it"):

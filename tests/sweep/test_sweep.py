@@ -44,7 +44,7 @@ def leaves(run: Path) -> dict[str, np.ndarray]:
 def swept(tmp_path_factory) -> Path:
     """A finished sweep of 2 x 2 settings with two seeds, in one batch."""
     out = tmp_path_factory.mktemp("sweeps")
-    assert sweep.main([*TINY, *SWEPT, "seeds=2", "tensorboard=true", f"out={out}", "name=whole"]) == 0
+    assert sweep.main([*TINY, *SWEPT, "seeds=2", "logger=[csv,tensorboard]", f"out={out}", "name=whole"]) == 0
     return out / "whole"
 
 
@@ -66,7 +66,7 @@ def test_each_member_equals_the_same_run_made_alone(swept, tmp_path):
     for name, values in theirs.items():
         np.testing.assert_allclose(ours[name], values, rtol=1e-4, atol=1e-5, err_msg=name)
     settings = (config.read(path / "config.yaml") for path in (member, tmp_path / "alone"))
-    one, other = (dataclasses.replace(s, name=None, out="", tensorboard=False) for s in settings)
+    one, other = (dataclasses.replace(s, name=None, out="", logger=("csv",)) for s in settings)
     assert one == other
 
 

@@ -219,6 +219,26 @@ class Export(OfOneRun):
 
 
 @dataclasses.dataclass(frozen=True)
+class Report:
+    """Write one HTML page about runs: final returns with intervals and differences, learning curves, films, settings,
+    machines, and the commands that train them again.
+
+    The page needs nothing but itself: pictures and films are in it, and no scripts. Runs whose settings differ only in
+    their seeds are one line; those that have not ended are shown as far as they are.
+    """
+
+    runs: tuple[Path, ...] = option(
+        "run directories; also [A,B], and patterns: runs='runs/sweep/*'", metavar="A,B", read=paths
+    )
+    out: Path = option("a name that ends with .html", default=Path("report.html"), new_file=True)
+    title: str | None = option("of the page", default=None, otherwise="what all runs have in common")
+    films: str = option(
+        "auto: those that there are, and of particle tasks others are made; found: those that there are",
+        default="auto", choices=("auto", "found", "none"),
+    )  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
 class Check:
     """Say what a run directory holds, what of it is damaged, and how to resume it. Changes nothing.
 
@@ -297,6 +317,9 @@ EXPORT = Command(
         "python -m matd3_jax.export run=runs/first format=numpy seed=2 out=policies",
     ),
 )  # fmt: skip
+REPORT = Command(
+    _python("report"), Report, examples=("python -m matd3_jax.report runs='runs/sweep/runs/*' out=sweep.html",)
+)
 CHECK = Command(
     _python("check"), Check, usage=("run=RUN_DIR", "sweep=SWEEP_DIR"),
     examples=("python -m matd3_jax.check run=runs/first", "python -m matd3_jax.check sweep=runs/sweep"),
@@ -310,5 +333,6 @@ COMMANDS: dict[str, Command] = {
     "plot": PLOT,
     "render": RENDER,
     "export": EXPORT,
+    "report": REPORT,
     "check": CHECK,
 }

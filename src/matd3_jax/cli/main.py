@@ -14,6 +14,7 @@ COMMANDS = {
     "plot": "draw learning curves of runs",
     "render": "make a film of an episode",
     "export": "write policies for other programs: ONNX, NumPy, JAX",
+    "report": "write a page about runs",
     "check": "say what a run directory holds and what is damaged",
 }
 

@@ -3,17 +3,16 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from matd3_jax.cli import arguments
 from matd3_jax.cli.arguments import Plot
-from matd3_jax.config import Config, diff
+from matd3_jax.config import diff
 from matd3_jax.errors import UserError, nearest
 from matd3_jax.figures import learning_curves
 from matd3_jax.figures.learning_curves import Line, Panel
-from matd3_jax.runs import curves, directory, divergence
+from matd3_jax.runs import alike, curves, directory, divergence
 from matd3_jax.runtime.terminal import say
 from matd3_jax.stats import bootstrap, intervals
 
@@ -26,7 +25,7 @@ BANDS = {"t": "95 % interval", "bootstrap": "95 % bootstrap interval", "sd": "±
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit code."""
     options = _checked(arguments.PLOT.parse(argv))
-    groups = _groups(options.runs)
+    groups = alike.groups(options.runs)
     settings = list(groups.values())
     found_labels = diff.label_differences(settings)
     labels = options.labels or found_labels
@@ -45,28 +44,15 @@ def main(argv: Sequence[str]) -> int:
         for name, columns in found.items()
     ]
     over = "" if options.window is None else f" (mean over the last {options.window:,} episodes)"
-    title = _common(settings) if options.title is None else options.title
+    title = alike.common(settings) if options.title is None else options.title
     caption = _caption(tables[0], many, options)
     learning_curves.compare(options.out, panels, X_LABELS[options.x] + over, title, caption, options.each)
     for panel, (name, columns) in zip(panels, found.items(), strict=True):
         for label, line, column, diverged in zip(labels, panel.lines, columns, lost, strict=True):
-            _tell(f"{label}: {name}", line.estimate, column, diverged, options)
+            if line is not None:
+                _tell(f"{label}: {name}", line.estimate, column, diverged, options)
     say(str(options.out))
     return 0
-
-
-def _groups(paths: Sequence[Path]) -> dict[tuple[Path, ...], Config]:
-    """Runs that differ only in their seeds belong together: (paths of a curve: settings of its first run)."""
-    found: list[tuple[dict[str, Any], list[Path], Config]] = []
-    for path in paths:
-        settings = directory.RunDirectory.open(path)[1]
-        own = diff.learning(settings)
-        members = next((members for other, members, _ in found if other == own), None)
-        if members is None:
-            found.append((own, [path], settings))
-        else:
-            members.append(path)
-    return {tuple(members): settings for _, members, settings in found}
 
 
 def _curves(
@@ -134,14 +120,6 @@ def _y_label(name: str, table: Mapping[str, np.ndarray]) -> str:
     if bare.endswith("_return"):
         return f"{kind} return, {bare.removesuffix('_return').replace('_', ' ')}"
     return bare.replace("_", " ") + (" (evaluation)" if kind == "evaluation" else "")
-
-
-def _common(settings: Sequence[Config]) -> str:
-    """Environment and algorithms, where they are the same in all runs of several."""
-    environments = list(dict.fromkeys(str(one.env["name"]) for one in settings))
-    names = list(dict.fromkeys(map(diff.algorithms, settings)))
-    parts = environments if len(environments) == 1 else []
-    return ", ".join([*parts, *(names if len(names) == 1 < len(settings) else [])])
 
 
 def _caption(table: Mapping[str, np.ndarray], many: bool, options: Plot) -> str:

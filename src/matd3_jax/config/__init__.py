@@ -1,7 +1,15 @@
 """Settings of a run: read from files and overrides in Hydra's grammar, typed, and checked before anything starts."""
 
 from matd3_jax.config.load import ROBOT_RECIPE, from_dict, load, parse, read, renamed, text, write
-from matd3_jax.config.schema import ADDED_LATER, HYPER_PARAMS, AlgoConfig, Config, DiagnosticsConfig
+from matd3_jax.config.schema import (
+    ADDED_LATER,
+    HYPER_PARAMS,
+    AlgoConfig,
+    Config,
+    DiagnosticsConfig,
+    MlflowConfig,
+    WandbConfig,
+)
 from matd3_jax.groups import GROUPS, known_names
 
 __all__ = [
@@ -11,7 +19,9 @@ __all__ = [
     "DiagnosticsConfig",
     "GROUPS",
     "HYPER_PARAMS",
+    "MlflowConfig",
     "ROBOT_RECIPE",
+    "WandbConfig",
     "from_dict",
     "known_names",
     "load",

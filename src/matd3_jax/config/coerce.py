@@ -43,6 +43,12 @@ def _convert(key: str, value: Any, hint: Any) -> Any:
         if isinstance(value, list | tuple) and all(type(v) is int for v in value):
             return tuple(value)
         raise UserError(f"{key}={value!r}: must be a list of whole numbers, for instance [64,64]")
+    if hint == tuple[str, ...]:
+        if isinstance(value, str):
+            return (value,)
+        if isinstance(value, list | tuple) and all(isinstance(v, str) for v in value):
+            return tuple(value)
+        raise UserError(f"{key}={value!r}: must be a list of words, for instance [csv,wandb]")
     plain = hint if isinstance(hint, type) else Mapping
     if not isinstance(value, plain) or (isinstance(value, bool) and hint is not bool):
         kind = {int: "a whole number", float: "a number", bool: "true or false", str: "a word"}.get(

@@ -16,7 +16,18 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from matd3_jax.config.coerce import plain, typed
-from matd3_jax.config.schema import ADDED_LATER, OF_FROZEN, RENAMED, TEXTS, AlgoConfig, Config, DiagnosticsConfig
+from matd3_jax.config.schema import (
+    ADDED_LATER,
+    LOGGERS,
+    OF_FROZEN,
+    RENAMED,
+    TEXTS,
+    AlgoConfig,
+    Config,
+    DiagnosticsConfig,
+    MlflowConfig,
+    WandbConfig,
+)
 from matd3_jax.config.validate import check
 from matd3_jax.errors import OptionError, UserError, nearest
 from matd3_jax.groups import GROUPS, known_names
@@ -165,7 +176,7 @@ def read(path: Path) -> Config:
         found = OmegaConf.to_container(OmegaConf.create(written)) if written.strip() else None
         if not isinstance(found, dict):
             raise UserError("it has no settings")
-        values = _with_defaults(renamed(found), ADDED_LATER)
+        values = _with_defaults(with_logger_list(renamed(found)), ADDED_LATER)
         if "physics" in _environment(values):
             from matd3_jax.envs.robots.engines.engine import RENAMED
 
@@ -197,6 +208,15 @@ def renamed(values: Mapping[Any, Any]) -> dict[Any, Any]:
     }
 
 
+def with_logger_list(values: Mapping[Any, Any]) -> dict[Any, Any]:
+    """Plain settings with the list `logger` where older ones have `tensorboard: true` or false."""
+    found = dict(values)
+    if "tensorboard" in found:
+        wanted = found.pop("tensorboard")
+        found.setdefault("logger", ["csv", "tensorboard"] if wanted else ["csv"])
+    return found
+
+
 def text(config: Config) -> str:
     """Every resolved value, as YAML."""
     return OmegaConf.to_yaml(OmegaConf.create(config.to_dict()))
@@ -216,10 +236,13 @@ def from_dict(values: Mapping[str, Any]) -> Config:
     if rest.get("adversary") is not None:
         adversary = typed(AlgoConfig, _algorithm(rest, "adversary"), "adversary.")
     diagnostics = typed(DiagnosticsConfig, _group(rest, "diagnostics", "diagnostics.q_bias=true"), "diagnostics.")
+    wandb = typed(WandbConfig, _group(rest, "wandb", "wandb.project=mine"), "wandb.")
+    mlflow = typed(MlflowConfig, _group(rest, "mlflow", "mlflow.experiment=mine"), "mlflow.")
     groups = {"env": env, "algo": algo, "adversary": adversary, "diagnostics": diagnostics}
-    config = typed(Config, {**rest, **groups}, "")
+    config = typed(Config, {**rest, **groups, "wandb": wandb, "mlflow": mlflow}, "")
     check(config)
-    return config
+    in_effect = tuple(name for name in LOGGERS if name == "csv" or name in config.logger)
+    return dataclasses.replace(config, logger=in_effect)
 
 
 def _group(values: Mapping[str, Any], key: str, example: str) -> Mapping[str, Any]:
@@ -279,12 +302,13 @@ def _check_keys(tree: DictConfig, values: Sequence[Override], known: Sequence[st
                 keys = [str(key) for key in node] if isinstance(node, DictConfig) else []
                 keys += known if not depth else []
                 # A key typed without its group, or in the wrong one, is a common slip: look there, too.
-                groups = ("algo", "env", "diagnostics")
+                groups = ("algo", "env", "diagnostics", "wandb", "mlflow")
                 elsewhere = [f"{group}.{name}" for group in groups if name in tree.get(group, {})]
                 elsewhere += [name] if depth and name in tree else []
                 now = RENAMED.get(name)
                 hint = f"did you mean {' or '.join(map(repr, elsewhere))}?" if elsewhere else nearest(name, keys)
                 hint = f"it is called {'.'.join([*path[:-1], now])!r} now" if now else hint
+                hint = "it is logger=[csv,tensorboard] now" if path == ["tensorboard"] else hint
                 raise UserError(
                     f"there is no key {override.key_or_group!r}{f' (in {prefix})' if prefix else ''}; {hint}"
                 )

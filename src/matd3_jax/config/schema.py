@@ -117,6 +117,27 @@ class DiagnosticsConfig:
     q_bias_steps: int = setting(BOOKKEEPING, least=1, before=100)
 
 
+LOGGERS = ("csv", "tensorboard", "wandb", "mlflow")
+"""Where the rows of the metrics table can go; csv, the table itself, is always among them."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WandbConfig:
+    """Where a run is on Weights & Biases; config.yaml says what each means."""
+
+    project: str | None = setting(BOOKKEEPING, before=None)
+    entity: str | None = setting(BOOKKEEPING, before=None)
+    mode: str | None = setting(BOOKKEEPING, before=None, choices=("online", "offline", "disabled"))
+
+
+@dataclasses.dataclass(frozen=True)
+class MlflowConfig:
+    """Where a run is in MLflow; config.yaml says what each means."""
+
+    tracking_uri: str | None = setting(BOOKKEEPING, before=None)
+    experiment: str | None = setting(BOOKKEEPING, before=None)
+
+
 @dataclasses.dataclass(frozen=True)
 class Config:
     """All settings of a run; config.yaml says what each means."""
@@ -154,7 +175,11 @@ class Config:
     checkpoint_every: int | None = setting(BOOKKEEPING, least=0)
     checkpoint_minutes: float = setting(BOOKKEEPING, least=0, before=10.0)
     keep_checkpoints: int = setting(BOOKKEEPING, least=1)
-    tensorboard: bool = setting(BOOKKEEPING)
+    logger: tuple[str, ...] = setting(BOOKKEEPING, before=("csv",), choices=LOGGERS)
+    logger_seeds: str = setting(BOOKKEEPING, before="runs", choices=("runs", "bands"))
+    wandb: WandbConfig = setting(BOOKKEEPING)
+    mlflow: MlflowConfig = setting(BOOKKEEPING)
+    video_every: int = setting(BOOKKEEPING, least=0, before=0)
     on_divergence: str = setting(BOOKKEEPING, choices=("continue", "stop"), before="continue")
 
     def teams(self) -> dict[str, AlgoConfig]:
@@ -203,6 +228,8 @@ UNSHARED = keys(Config, SEEDS, BOOKKEEPING, splits=False)
 ADDED_LATER = {
     **_before(Config),
     "diagnostics": _before(DiagnosticsConfig),
+    "wandb": _before(WandbConfig),
+    "mlflow": _before(MlflowConfig),
     "algo": _before(AlgoConfig),
     "adversary": _before(AlgoConfig),
 }

@@ -24,7 +24,8 @@ def check(config: "Config") -> None:
         f"normalize_least_deviation={least} goes with normalize_observations=true",
     )
     diagnostics = config.diagnostics
-    _check_bounds("diagnostics.", diagnostics)
+    for group in ("diagnostics", "wandb", "mlflow"):
+        _check_bounds(f"{group}.", getattr(config, group))
     need(
         not (diagnostics.q_bias and config.eval_every == 0),
         "diagnostics.q_bias=true measures at evaluations, and eval_every=0 means none: give eval_every=, in env steps",

@@ -71,22 +71,63 @@ def play(
     max_steps: int | None = None,
     keep: Callable[[Any], Any] = lambda state: state,
 ) -> Episode:
-    """Play an episode with the policies of one seed.
+    """Play an episode with the policies of one seed; see `Player`.
+
+    Args:
+        state: what was trained, leading axis [seeds].
+        seed: index of the seed in the run, from 0.
+    """
+    return Player(training, number, deterministic, max_steps, keep).play(state, seed)
+
+
+class Player:
+    """Plays the same episode with policies as they are at different times; compiled once.
 
     Deterministic, it is the episode `number` of those that `TrainingSession.evaluate` (and the command `evaluate`)
     plays with its default seed.
 
     Args:
-        state: what was trained, leading axis [seeds].
-        seed: index of the seed in the run, from 0.
         deterministic: no noise at all; otherwise the policies act as they do in training.
         max_steps: env steps after which to stop.
         keep: what to keep of a state of the environment; by default all of it.
     """
-    steps = training.env.episode_length if max_steps is None else min(max_steps, training.env.episode_length)
-    trainer = training.trainer
-    # Through the host: the seeds may lie on different devices.
-    policy = jax.device_get(jax.tree.map(lambda leaf: leaf[seed], trainer.policy(state, average=deterministic)))
+
+    def __init__(
+        self,
+        training: TrainingSession,
+        number: int = 0,
+        deterministic: bool = True,
+        max_steps: int | None = None,
+        keep: Callable[[Any], Any] = lambda state: state,
+    ):
+        self.training, self.deterministic = training, deterministic
+        self.steps = training.env.episode_length if max_steps is None else min(max_steps, training.env.episode_length)
+        self._run = jax.jit(_episode(training, number, deterministic, self.steps, keep))
+
+    def play(self, state: TrainState, seed: int = 0) -> Episode:
+        """Play it with the policies of the seed with this index. state: leading axis [seeds]."""
+        training, layout = self.training, self.training.layout
+        policies = training.trainer.policy(state, average=self.deterministic)
+        # Through the host: the seeds may lie on different devices.
+        policy = jax.device_get(jax.tree.map(lambda leaf: leaf[seed], policies))
+        # The key of `TrainingSession.evaluate` with its default seed.
+        key = jax.random.fold_in(jax.random.key(0), 2**31 - 1)
+        states, reward, terminated, truncated = self._run(policy, key)
+        ended = np.flatnonzero(np.asarray(terminated | truncated))
+        length = int(ended[0]) + 1 if len(ended) else self.steps
+        so_far = np.cumsum(np.asarray(reward, np.float64)[:length], axis=0)
+        so_far = np.concatenate([np.zeros((1, layout.num_agents)), so_far])
+        return Episode(
+            step=np.arange(length + 1),
+            states=jax.tree.map(lambda leaf: leaf[: length + 1], states),
+            returns={team: so_far @ training.team_weights(team) for team in dict.fromkeys(layout.teams)},
+            terminated=bool(terminated[length - 1]),
+            truncated=bool(truncated[length - 1]),
+        )
+
+
+def _episode(training: TrainingSession, number: int, deterministic: bool, steps: int, keep: Callable) -> Callable:
+    """(policy, key) -> (states [frames], rewards, terminated, truncated), each but the first [env steps]."""
     env, layout = training.env, training.layout
 
     def run(policy, key):
@@ -107,17 +148,4 @@ def play(
         states = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), keep(first), later)
         return states, *rest
 
-    # The key of `TrainingSession.evaluate` with its default seed.
-    key = jax.random.fold_in(jax.random.key(0), 2**31 - 1)
-    states, reward, terminated, truncated = jax.jit(run)(policy, key)
-    ended = np.flatnonzero(np.asarray(terminated | truncated))
-    length = int(ended[0]) + 1 if len(ended) else steps
-    so_far = np.cumsum(np.asarray(reward, np.float64)[:length], axis=0)
-    so_far = np.concatenate([np.zeros((1, layout.num_agents)), so_far])
-    return Episode(
-        step=np.arange(length + 1),
-        states=jax.tree.map(lambda leaf: leaf[: length + 1], states),
-        returns={team: so_far @ training.team_weights(team) for team in dict.fromkeys(layout.teams)},
-        terminated=bool(terminated[length - 1]),
-        truncated=bool(truncated[length - 1]),
-    )
+    return run

@@ -3,10 +3,11 @@
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
@@ -36,7 +37,8 @@ class Panel(NamedTuple):
     """What stands in one pair of axes; the lines of all panels have the same labels in the same order."""
 
     y_label: str
-    lines: Sequence[Line]
+    lines: Sequence[Line | None]
+    """None keeps a color and dashes for a line that another panel has."""
 
 
 def check(path: Path) -> Path:
@@ -49,7 +51,14 @@ def check(path: Path) -> Path:
 
 
 def compare(
-    path: Path, panels: Sequence[Panel], x_label: str, title: str = "", caption: str = "", each: bool = False
+    path: Path,
+    panels: Sequence[Panel],
+    x_label: str,
+    title: str = "",
+    caption: str = "",
+    each: bool = False,
+    legend: bool = True,
+    dark: bool = False,
 ) -> None:
     """Draw lines with bands, side by side in panels, in colors and dashes that can be distinguished.
 
@@ -58,17 +67,22 @@ def compare(
     Args:
         caption: over the legend.
         each: every seed, too, thin.
+        legend: False: none, for a page that has its own (`style.SERIES`, `style.STYLES`).
+        dark: for a dark page.
     """
     columns = min(len(panels), 2)
     rows = math.ceil(len(panels) / columns)
     width, height = 3.3 * columns + 1.2, 0.4 + 2.6 * rows
-    with matplotlib.rc_context(style.PRINTED):
+    with matplotlib.rc_context({**style.PRINTED, **(style.DARK if dark else {})}):
         figure = Figure(figsize=(width, height), layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.subplots(rows, columns, squeeze=False, sharex=True).ravel()
         for k, (axis, panel) in enumerate(zip(axes, panels, strict=False)):
             for i, line in enumerate(panel.lines):
+                if line is None:
+                    continue
                 color, dashes = style.SERIES[i % len(style.SERIES)], style.STYLES[i % len(style.STYLES)]
+                color = style.web(style.WHITE) if dark and color == style.web(style.BLACK) else color
                 style.band(axis, line.x, line.estimate, color, line.label, dashes, line.seeds if each else None)
             style.dress(axis)
             axis.set_ylabel(panel.y_label)
@@ -80,19 +94,26 @@ def compare(
             axis.set_visible(False)
         if title:
             (figure.suptitle if len(panels) > 1 else axes[0].set_title)(title, fontsize=style.PRINTED["axes.titlesize"])
-        frame = {"title": caption or None, "frameon": False, "handlelength": 3, "alignment": "left"}
-        if len(panels[0].lines) > 4 or len(panels) > 1:
-            legend = figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right upper", **frame)
-        else:
-            legend = axes[0].legend(loc="best", **frame)
-        legend.get_title().set_fontsize(style.PRINTED["legend.fontsize"])
-        if legend.axes is None:  # to the right of the panels: they keep their size
-            extent = legend.get_window_extent(figure.canvas.get_renderer())
-            figure.set_size_inches(width + extent.width / figure.dpi, max(height, extent.height / figure.dpi + 0.2))
+        if legend:
+            _add_legend(figure, axes[0], caption, outside=len(panels[0].lines) > 4 or len(panels) > 1)
         try:
             style.save(figure, path, dpi=200)
         except OSError as error:
             raise UserError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _add_legend(figure: Figure, axis: Axes, caption: str, outside: bool) -> None:
+    """Write a legend into a free corner, or to the right of all panels, which keep their size."""
+    frame: dict[str, Any] = {"title": caption or None, "frameon": False, "handlelength": 3, "alignment": "left"}
+    if outside:
+        added = figure.legend(*axis.get_legend_handles_labels(), loc="outside right upper", **frame)
+    else:
+        added = axis.legend(loc="best", **frame)
+    added.get_title().set_fontsize(style.PRINTED["legend.fontsize"])
+    if outside:
+        width, height = figure.get_size_inches()
+        extent = added.get_window_extent()
+        figure.set_size_inches(width + extent.width / figure.dpi, max(height, extent.height / figure.dpi + 0.2))
 
 
 def learning_curve(

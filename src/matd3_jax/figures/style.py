@@ -58,6 +58,13 @@ PRINTED: dict[Any, Any] = {
 """Sizes in points, for a picture that is printed at its own size; letters stay letters in PDF and SVG."""
 
 
+DARK: dict[Any, Any] = {
+    **dict.fromkeys(("figure.facecolor", "axes.facecolor", "savefig.facecolor"), "#1D2328"),
+    **dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), "#E4E8EC"),
+}
+"""Over `PRINTED`, for a dark page."""
+
+
 def save(figure: "Figure", path: Path, dpi: int) -> None:
     """Write a figure to `path`, in the format of its suffix, whole or not at all. dpi: dots an inch of a picture."""
     with files.replacing(path) as new:

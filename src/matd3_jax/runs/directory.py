@@ -37,8 +37,9 @@ class RunDirectory:
     """Where a run leaves its files.
 
     config.yaml (all resolved settings), machine.json (versions and devices), metrics.csv (one row an interval and
-    seed), checkpoints/, learning_curve.png, summary.json (written at the end), on request q_bias.png and tensorboard/,
-    start.npz of a run that begins with networks of others.
+    seed), checkpoints/, learning_curve.png, summary.json (written at the end), on request q_bias.png, tensorboard/,
+    videos/, and of W&B and MLflow wandb/, wandb.json and mlflow.json (what they call the run), start.npz of a run that
+    begins with networks of others.
     """
 
     def __init__(self, path: Path):
@@ -48,6 +49,8 @@ class RunDirectory:
         self.curve = path / "learning_curve.png"
         self.q_bias = path / "q_bias.png"
         self.tensorboard = path / "tensorboard"
+        self.videos = path / "videos"
+        self.wandb = path / "wandb"
 
     @staticmethod
     def check_new(path: Path, or_another: bool = False) -> None:
@@ -153,12 +156,17 @@ class RunDirectory:
         own = {"config.yaml", "machine.json", START, *(left.name for left in files.partial(self.path))}
         return {found.name for found in self.path.iterdir()} <= own
 
+    @property
+    def in_place(self) -> tuple[Path, ...]:
+        """What is written without being replaced as a whole."""
+        return self.metrics, self.checkpoints, self.tensorboard, self.videos, self.wandb
+
     def clean(self) -> None:
         """Take away the partial files that killed writes left, while the lock of the directory is held.
 
         Raises UserError where what is written in place is a link: what is behind it is not the run's.
         """
-        for path in (self.metrics, self.checkpoints, self.tensorboard):
+        for path in self.in_place:
             if path.is_symlink():
                 raise UserError(f"{path} is a link: nothing is written through it")
         files.remove_partial(self.path)

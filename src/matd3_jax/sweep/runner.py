@@ -24,11 +24,14 @@ from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.runtime.terminal import say
 from matd3_jax.sweep import batching
+from matd3_jax.tracking.messages import FINISHED, STOPPED
 from matd3_jax.training import best as best_evaluations
-from matd3_jax.training import checkpoint, finish, host_states, starting
+from matd3_jax.training import checkpoint, film, finish, host_states, outputs, starting
 from matd3_jax.training import run as training_run
-from matd3_jax.training.loggers import DivergenceLogger, Logger, TableLogger, TensorBoardLogger
+from matd3_jax.training.film import Filmer
+from matd3_jax.training.loggers import CallbackLogger, DivergenceLogger, Logger, TableLogger
 from matd3_jax.training.memory import most_seeds, needed
+from matd3_jax.training.outputs import Outputs
 from matd3_jax.training.progress import ProgressBar
 from matd3_jax.training.rows import Row
 from matd3_jax.training.session import TrainingSession
@@ -109,8 +112,8 @@ class Sweep:
         for path in _entries(self.runs):
             if path.name not in planned and RunDirectory(path).bare:  # a process was killed while it planned
                 shutil.rmtree(path)
-        if any(config.tensorboard for config in settings.values()):
-            TensorBoardLogger.check()
+        for config in settings.values():
+            outputs.check(config)
         if any(config.on_divergence != "continue" for config in settings.values()):
             raise UserError("on_divergence=stop: a sweep's runs are trained side by side, and none ends the others")
         budget = devices.free_memory(self.processes.local) if budget is None else budget
@@ -204,8 +207,7 @@ class Batch:
         self.members = sweep.members(number)
         self.training = TrainingSession(self.members[0], members=self.members, processes=processes)
         self.checkpoints = sweep.folder_of(number) / "checkpoints"
-        ends = np.cumsum([config.seeds for config in self.members])
-        self.seeds = [slice(end - config.seeds, end) for end, config in zip(ends.tolist(), self.members, strict=True)]
+        self.seeds = film.where(self.members)
         """Where each run's seeds are."""
         self.table = TableLogger(self.runs, self.seeds)
         self.watch = DivergenceLogger(
@@ -216,30 +218,46 @@ class Batch:
 
     def train(self, stop: Stop) -> None:
         """From the last checkpoint, or from the start, to the end or until a signal comes."""
-        training, settings, begun = self.training, self.members[0], time.monotonic()
+        training, begun = self.training, time.monotonic()
         training.check_memory(recorded=True)
         if self.processes.first:
             self._announce()
         state, row, fresh = self._begin()
+        with self._outputs() as out:
+            self._train(stop, state, row, fresh, begun, out)
+
+    def _outputs(self) -> Outputs:
+        """Where rows go besides the directories; nowhere from other processes than the first."""
+        there = slice(None) if self.processes.first else slice(0)
+        parts = self.runs[there], self.members[there], self.seeds[there]
+        return Outputs(*parts, say, say, self.watch.diverged, self.sweep.folder.absolute().name)
+
+    def _train(self, stop: Stop, state: TrainState, row: Row, fresh: bool, begun: float, out: Outputs) -> None:
+        training = self.training
         loggers: list[Logger] = []
+        filmer = None
         if self.processes.first:
+            if fresh:
+                out.log(row)
             progress = ProgressBar(training, row, self.watch.diverged)
-            loggers = [self.table, self.watch, progress]
-            if settings.tensorboard:
-                loggers.append(TensorBoardLogger(self.runs, self.seeds))
+            loggers = [self.table, self.watch, progress, CallbackLogger(out.log)]
+            if Filmer.wanted(self.members):
+                filmer = Filmer(training, self.runs, self.members, self.seeds, say, out.attach)
 
         def save(state: TrainState, step: int) -> None:
             for run in self.runs if self.processes.first else ():
                 run.sync()
-            own = {"share": training.share, "best": training.best}
-            checkpoint.save(self.checkpoints, step, training.trainer, state, keep=1, **own)
+            to = self.checkpoints, step, training.trainer, state
+            checkpoint.save(*to, keep=1, share=training.share, best=training.best)
 
-        outcome = training_run.run(training, state, row, loggers, save, stop, save_first=fresh)
+        outcome = training_run.run(training, state, row, loggers, save, stop, save_first=fresh, film=filmer)
         if outcome.stopped is not None:
             save(outcome.state, int(outcome.row["step"][0]))
+            out.how = STOPPED
             return
         rates = progress.rates() if self.processes.first else {}
-        self._finish(outcome.state, outcome.row, {"seconds": round(time.monotonic() - begun, 1), **rates})
+        self._finish(outcome.state, outcome.row, {"seconds": round(time.monotonic() - begun, 1), **rates}, out)
+        out.how = FINISHED
 
     def _begin(self) -> tuple[TrainState, Row, bool]:
         """The state to train from, its row, and whether nothing was trained yet."""
@@ -274,13 +292,12 @@ class Batch:
         updates = self.training.trainer.updates(int(state.rollouts))
         return state, {"step": np.array([done]), "updates": np.array([updates])}, False
 
-    def _finish(self, state: TrainState, row: Row, facts: Mapping[str, Any]) -> None:
+    def _finish(self, state: TrainState, row: Row, facts: Mapping[str, Any], out: Outputs) -> None:
         """Leave each run as if it had been trained alone, but for its replay."""
         trainer, share, done = self.training.trainer, self.training.share, int(row["step"][0])
         facts, best = {**facts, "side_by_side": share.total}, self.training.best
-        for run, config, seeds in zip(self.runs, self.members, self.seeds, strict=True):
-            own = {"seeds": seeds, "share": share, "best": best}
-            saved = checkpoint.save(run.checkpoints, done, trainer, state, keep=1, **own)
+        for number, (run, config, seeds) in enumerate(zip(self.runs, self.members, self.seeds, strict=True)):
+            saved = checkpoint.save(run.checkpoints, done, trainer, state, keep=1, seeds=seeds, share=share, best=best)
             if not self.processes.first:
                 continue
             diverged = {
@@ -290,7 +307,8 @@ class Batch:
             }
             settings = str(config.name), config.diagnostics.q_bias
             own_facts = {**facts, **best_evaluations.summary(saved, range(config.seed, config.seed + config.seeds))}
-            finish.finish(run, self.training.layout, *settings, done, own_facts, diverged)
+            found = finish.finish(run, self.training.layout, *settings, done, own_facts, diverged)
+            out.finish(number, found)
 
     def _announce(self) -> None:
         training, config = self.training, self.members[0]

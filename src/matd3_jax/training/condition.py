@@ -106,7 +106,7 @@ def of_run(path: Path) -> Condition:
             starting.read(run.path)
         except UserError as error:
             problems.append(str(error))
-    for link in (run.metrics, run.checkpoints, run.tensorboard):
+    for link in run.in_place:
         if link.is_symlink():
             problems.append(f"{link} is a link: a resume writes nothing through it")
     return Condition(run, settings, whole, damaged, table, gaps, lock.holder(run.path), tuple(problems))

@@ -15,13 +15,17 @@ from matd3_jax.training.session import TrainingSession
 
 
 class Logger(Protocol):
-    """Takes the rows of a run, one each logging interval."""
+    """Takes the rows of a run, one each logging interval.
+
+    One that has these methods, too, gets more of a run that leaves a directory: `attach(step, path, seed)` the films on
+    the way and the figures at the end (seed: its number, None of all), `summarize(found)` what is in summary.json.
+    """
 
     def log(self, row: Row) -> None:
         """Take a row: columns [seeds], "step" and "seed" among them."""
 
     def close(self) -> None:
-        """End: no row will come any more."""
+        """End: nothing will come any more."""
 
 
 class TableLogger:
@@ -53,7 +57,9 @@ class TensorBoardLogger:
         try:
             import tensorboardX  # noqa: F401
         except ImportError:
-            raise UserError("tensorboard=true needs tensorboardX: pip install 'matd3_jax[tensorboard]'") from None
+            raise UserError(
+                "logger=[tensorboard] needs the package tensorboardX: pip install 'matd3_jax[tensorboard]'"
+            ) from None
 
     def log(self, row: Row) -> None:
         for writer, own in self.parts:

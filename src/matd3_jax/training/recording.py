@@ -19,8 +19,11 @@ from matd3_jax.runs.divergence import Divergence
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
-from matd3_jax.training import announcement, best, checkpoint, finish, host_states, starting
-from matd3_jax.training.loggers import DivergenceLogger, Logger, TableLogger, TensorBoardLogger, warn
+from matd3_jax.tracking.messages import FAILED, FINISHED, STOPPED
+from matd3_jax.training import announcement, best, checkpoint, finish, host_states, outputs, starting
+from matd3_jax.training.film import Filmer
+from matd3_jax.training.loggers import CallbackLogger, DivergenceLogger, Logger, TableLogger, warn
+from matd3_jax.training.outputs import Outputs
 from matd3_jax.training.progress import ProgressBar
 from matd3_jax.training.rows import Row
 from matd3_jax.training.run import Outcome, run
@@ -45,9 +48,10 @@ class Recorder:
         processes: which train together; the first alone writes and speaks.
         heed_signals: whether SIGINT, SIGTERM and SIGHUP end a run after a checkpoint (of a program of its own), or
             stay with the program that calls.
-        say: gets the lines about a run; None: nothing is said, nor a progress bar shown, but of a seed that diverges is
+        say: gets the lines about a run; None: nothing is said, nor a progress bar shown, but a seed that diverges is
             reported by a RuntimeWarning.
-        loggers: get the rows of the metrics table, too.
+        loggers: get the rows of the metrics table, films, figures and the summary, too; their errors end no run.
+        callback: gets the rows; its errors do.
     """
 
     def __init__(
@@ -56,8 +60,9 @@ class Recorder:
         heed_signals: bool = False,
         say: Say | None = None,
         loggers: Sequence[Logger] = (),
+        callback: Callable[[Row], object] | None = None,
     ):
-        self.processes, self.loggers = processes, loggers
+        self.processes, self.loggers, self.callback = processes, loggers, callback
         self.heed_signals = heed_signals
         self.say: Say = say if say is not None and processes.first else lambda line: None
         self.shows_progress = say is not None
@@ -132,8 +137,7 @@ class Recorder:
     def _checked(self, settings: Config, env: Environment | None) -> TrainingSession:
         training = TrainingSession(settings, env, processes=self.processes)
         training.check_memory(recorded=True)
-        if settings.tensorboard:
-            TensorBoardLogger.check()
+        outputs.check(settings)
         return training
 
     def _stop(self) -> Stop | None:
@@ -152,19 +156,27 @@ class Recorder:
         for line in announcement.first_lines(training, directory) if self.processes.first else ():
             self.say(line)
         state, row = training.start(starting.of_directory(directory.path))
-        if self.processes.first:
-            directory.append(row)
-            for logger in self.loggers:
-                logger.log(row)
         watch = self._watch(training, {})
         if self.processes.first:
+            directory.append(row)
             watch.log(row)
         return self._to_the_end(training, directory, state, row, stop, watch, fresh=True)
+
+    @property
+    def _tell(self) -> Say:
+        """What gets warnings."""
+        return self.say if self.shows_progress else warn
 
     def _watch(self, training: TrainingSession, diverged: Mapping[int, Divergence]) -> DivergenceLogger:
         """Knows what has diverged so far, given by the numbers of the seeds."""
         known = {seed - training.config.seed: found for seed, found in diverged.items()}
-        return DivergenceLogger(training, self.say if self.shows_progress else warn, known)
+        return DivergenceLogger(training, self._tell, known)
+
+    def _outputs(self, training: TrainingSession, directory: RunDirectory, watch: DivergenceLogger) -> Outputs:
+        """The loggers beside the run's directory; none in other processes than the first."""
+        seeds, first = [slice(0, training.share.total)], self.processes.first
+        runs, members, own = ([directory], [training.config], self.loggers) if first else ([], [], ())
+        return Outputs(runs, members, seeds[: len(runs)], self._tell, self.say, watch.diverged, own=own)
 
     def _diverged(
         self, training: TrainingSession, directory: RunDirectory, state: TrainState, step: int
@@ -194,7 +206,8 @@ class Recorder:
             if self.processes.first:
                 self.say(f"{directory.path} has come to its end; its figures and its summary are made")
                 self._notes(training, directory, done)
-                self._finish(training, directory, done, {}, watch)
+                with self._outputs(training, directory, watch) as out:
+                    self._finish(training, directory, done, {}, watch, out)
             return Recorded(directory, training, Outcome(state, row, None, watch.diverged))
         if self.processes.first:
             for line in announcement.first_lines(training, directory, done):
@@ -231,40 +244,66 @@ class Recorder:
         fresh: bool = False,
     ) -> Recorded:
         """Train to the end, or until a signal comes or a seed diverges that must not."""
+        with self._outputs(training, directory, watch) as out:
+            return self._trained(training, directory, state, row, stop, watch, fresh, out)
+
+    def _trained(
+        self,
+        training: TrainingSession,
+        directory: RunDirectory,
+        state: TrainState,
+        row: Row,
+        stop: Stop | None,
+        watch: DivergenceLogger,
+        fresh: bool,
+        out: Outputs,
+    ) -> Recorded:
         settings, begun = training.config, time.monotonic()
         loggers: list[Logger] = []
-        progress = None
+        progress = film = None
         if self.processes.first:
             loggers = [TableLogger([directory]), watch]
+            others = [CallbackLogger(out.log)]  # closed later: the summary is still to come
+            others += [] if self.callback is None else [CallbackLogger(self.callback)]
+            for logger in others if fresh else ():
+                logger.log(row)
             if self.shows_progress:
                 progress = ProgressBar(training, row, watch.diverged)
                 loggers.append(progress)
-            if settings.tensorboard:
-                loggers.append(TensorBoardLogger([directory]))
-            loggers += self.loggers
+            loggers += others
+            if Filmer.wanted([settings]):
+                seeds = [slice(0, len(training.seeds))]
+                film = Filmer(training, [directory], [settings], seeds, self._tell, out.attach)
 
         def save(state: TrainState, step: int) -> None:
             keep = settings.keep_checkpoints
             if self.processes.first:
                 directory.sync()
-            own = {"share": training.share, "best": training.best}
-            checkpoint.save(directory.checkpoints, step, training.trainer, state, keep, **own)
+            to = directory.checkpoints, step, training.trainer, state, keep
+            checkpoint.save(*to, share=training.share, best=training.best)
 
-        outcome = run(training, state, row, loggers, save, stop, save_first=fresh)
+        outcome = run(training, state, row, loggers, save, stop, save_first=fresh, film=film)
         step = int(outcome.row["step"][0])
         save(outcome.state, step)
         if self.processes.first:
             if outcome.finished:
                 rates = {} if progress is None else progress.rates()
                 facts = {"seconds": round(time.monotonic() - begun, 1), **rates}
-                self._finish(training, directory, step, facts, watch)
+                self._finish(training, directory, step, facts, watch, out)
             else:
+                out.how = STOPPED if outcome.stopped is not None else FAILED
                 title, diverged = announcement.title(training), self._by_number(training, watch)
                 finish.draw(directory, training.layout, title, settings.diagnostics.q_bias, diverged)
         return Recorded(directory, training, outcome)
 
     def _finish(
-        self, training: TrainingSession, directory: RunDirectory, done: int, facts: dict, watch: DivergenceLogger
+        self,
+        training: TrainingSession,
+        directory: RunDirectory,
+        done: int,
+        facts: dict,
+        watch: DivergenceLogger,
+        out: Outputs,
     ) -> None:
         diverged, with_q_bias = self._by_number(training, watch), training.config.diagnostics.q_bias
         title = announcement.title(training)
@@ -274,6 +313,8 @@ class Recorder:
         found = finish.finish(directory, training.layout, title, with_q_bias, done, facts, diverged)
         for line in announcement.last_lines(training, directory, found, diverged):
             self.say(line)
+        out.finish(0, found)
+        out.how = FINISHED
 
     @staticmethod
     def _by_number(training: TrainingSession, watch: DivergenceLogger) -> dict[int, Divergence]:

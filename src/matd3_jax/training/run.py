@@ -43,6 +43,7 @@ def run(
     save: Callable[[TrainState, int], object] | None = None,
     stop: Stop | None = None,
     save_first: bool = False,
+    film: Callable[[TrainState, int, int], object] | None = None,
 ) -> Outcome:
     """Train interval after interval to the end, or until a signal comes, or with `on_divergence=stop` until a seed
     diverges; the loggers are closed then.
@@ -56,6 +57,7 @@ def run(
             taken `SHARE` times as long.
         stop: signals that have come; None: none are heeded.
         save_first: write a checkpoint before anything is trained.
+        film: sees the state after each interval, with the env steps before and after it.
     """
     step = saved = int(row["step"][0])
     every, minutes = training.checkpoint_every, training.config.checkpoint_minutes
@@ -91,9 +93,11 @@ def run(
         signal = stopped()
         while step < training.total_steps and signal is None and not halt:
             state, row = training.advance(state)
-            step = int(row["step"][0])
+            before, step = step, int(row["step"][0])
             for logger in loggers:
                 logger.log(row)
+            if film is not None:
+                film(state, before, step)
             if due():
                 write(state)
             signal, halt = stopped(), halted()

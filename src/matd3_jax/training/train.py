@@ -13,6 +13,7 @@ from matd3_jax.config.schema import TEXTS
 from matd3_jax.envs.check import check
 from matd3_jax.envs.environment import Environment
 from matd3_jax.runtime import devices
+from matd3_jax.training import outputs
 from matd3_jax.training.loggers import CallbackLogger, DivergenceLogger, HistoryLogger, Logger, warn
 from matd3_jax.training.rows import Row
 from matd3_jax.training.run import Outcome, run
@@ -64,7 +65,8 @@ def train(
         run_dir: a directory to be made, with everything that the command leaves in one: settings, metrics, checkpoints,
             figures, summary; `resume` trains the run on. None: no files are written.
         callback: called with every interval's row (columns [seeds]) as it comes.
-        loggers: get the same rows, and are closed at the end (see `training.loggers.Logger`).
+        loggers: get the same rows, and are closed at the end (see `training.loggers.Logger`). An error of theirs is a
+            RuntimeWarning and ends no run; one of `callback` does.
 
     A seed that diverges is reported by a RuntimeWarning, and is in the result's `diverged`.
 
@@ -88,9 +90,11 @@ def train(
     config = configuration.load(chosen if own is not None else [f"env={env}", *chosen])
     if own is not None:
         config = dataclasses.replace(config, env={"name": type(own).__name__})
-    every = [*loggers, *([] if callback is None else [CallbackLogger(callback)])]
     if run_dir is not None:
-        return _result(_recorder(every).start(config, Path(run_dir), own))
+        return _result(_recorder(loggers, callback).start(config, Path(run_dir), own))
+    outputs.check(config, recorded=False)
+    every: list[Logger] = [outputs.Harmless(logger, warn) for logger in loggers]
+    every += [] if callback is None else [CallbackLogger(callback)]
     training = TrainingSession(config, own)
     state, row = training.start()
     history = HistoryLogger(row)
@@ -129,15 +133,14 @@ def resume(
     devices.prepare()
     if env is not None:
         check(env)
-    every = [*loggers, *([] if callback is None else [CallbackLogger(callback)])]
-    return _result(_recorder(every).resume(Path(run_dir), checkpoint, total_steps, env, unpickle))
+    return _result(_recorder(loggers, callback).resume(Path(run_dir), checkpoint, total_steps, env, unpickle))
 
 
-def _recorder(loggers: Sequence[Logger]) -> "Recorder":
+def _recorder(loggers: Sequence[Logger], callback: Callable[[Row], None] | None) -> "Recorder":
     """Imported here: figures and checkpoints are for runs that leave a directory."""
     from matd3_jax.training.recording import Recorder
 
-    return Recorder(loggers=loggers)
+    return Recorder(loggers=loggers, callback=callback)
 
 
 def _result(recorded: "Recorded") -> Result:
