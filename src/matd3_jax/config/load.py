@@ -26,6 +26,9 @@ DEEPEST, LARGEST_FILE = 20, 10**6
 
 _MALFORMED = (yaml.YAMLError, OmegaConfBaseException)
 
+OPEN = ("env.kwargs",)
+"""Groups that take any keys: options of other libraries' environments."""
+
 ROBOT_RECIPE = "fast"
 """What robots train by unless a recipe is given, on every machine."""
 
@@ -63,7 +66,7 @@ def load(overrides: Sequence[str] = (), known: Sequence[str] = ()) -> Config:
         lines.append(f"+algo@adversary={adversary[-1]}")
     try:
         tree = _files(tuple(lines))
-        if "robot" in tree:
+        if "robot" in tree and (tree.robot is True or recipe):
             lines.append(f"+recipe={recipe[-1] if recipe else ROBOT_RECIPE}")
         elif recipe and recipe[-1] != "paper":
             raise UserError(f"recipe={recipe[-1]} is for robots; {tree.env.name} has the paper's settings only")
@@ -71,6 +74,9 @@ def load(overrides: Sequence[str] = (), known: Sequence[str] = ()) -> Config:
         _check_keys(tree, values, known)
         tree = copy.deepcopy(_files(tuple(lines)))
         for override in values:
+            if _is_open(override.key_or_group):
+                OmegaConf.update(tree, override.key_or_group, override.value(), merge=True, force_add=True)
+                continue
             if override.is_add() and not override.is_force_add():
                 raise UserError(f"cannot add {_line(override)!r}: the key is there, write it without the +")
             _update(tree, override)
@@ -249,6 +255,12 @@ def _check_keys(tree: DictConfig, values: Sequence[Override], known: Sequence[st
                     f"there is no key {override.key_or_group!r}{f' (in {prefix})' if prefix else ''}; {hint}"
                 )
             node = node[name] if OmegaConf.is_config(node) and not OmegaConf.is_missing(node, name) else node
+            if ".".join(path[: depth + 1]) in OPEN:
+                break
+
+
+def _is_open(key: str) -> bool:
+    return any(f"{key}.".startswith(f"{group}.") for group in OPEN)
 
 
 def _update(tree: DictConfig, override: Override) -> None:

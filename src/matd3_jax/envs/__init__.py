@@ -22,6 +22,7 @@ __all__ = [
     "Simplex",
     "TimeStep",
     "check",
+    "foreign",
     "make",
     "names",
     "options",
@@ -52,10 +53,21 @@ _CLASSES = {
     "brax_swimmer": (".robots.brax", "BraxSwimmer"),
 }
 
+_FOREIGN = {
+    "jaxmarl": ("..interop.from_jaxmarl", "JaxMARLTask"),
+    "playground": ("..interop.from_playground", "PlaygroundTask"),
+}
+"""Environments of other libraries, whose option `id` names one of theirs: they need extras."""
+
 
 def names() -> tuple[str, ...]:
-    """Names `make` knows."""
+    """Names `make` knows, but for those of `foreign`."""
     return tuple(_CLASSES)
+
+
+def foreign() -> tuple[str, ...]:
+    """Names `make` knows that stand for the environments of another library, chosen by the option `id`."""
+    return tuple(_FOREIGN)
 
 
 def options(name: str) -> dict[str, Any]:
@@ -86,7 +98,8 @@ def make(name: str, **options_: Any) -> Environment:
 
 
 def _find(name: str) -> Any:
-    if name not in _CLASSES:
-        raise OptionError(f"no environment is called {name!r}; {nearest(name, _CLASSES)}")
-    module, class_ = _CLASSES[name]
+    known = _CLASSES | _FOREIGN
+    if name not in known:
+        raise OptionError(f"no environment is called {name!r}; {nearest(name, known)}")
+    module, class_ = known[name]
     return getattr(importlib.import_module(module, __name__), class_)
