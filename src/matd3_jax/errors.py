@@ -12,6 +12,13 @@ class OptionError(ValueError):
     """A name or an option that no environment takes; the message names the key, the value and what is allowed."""
 
 
+class HostError(UserError):
+    """What an environment that is stepped in Python, on the host, did not do; one line.
+
+    Raised while the compiled program runs it comes out as JAX's own error, with this one's text in it.
+    """
+
+
 def nearest(word: object, known: Iterable[str]) -> str:
     """The end of an error message: what was probably meant, or else everything that is known."""
     known = sorted(known)

@@ -89,7 +89,7 @@ def test_command(command):
     elif name == "experiments.all":
         study.parse(all_studies.STUDIES["cooperative"], settings)
     elif getattr(options, "resume", None) is not None:
-        assert {word.split("=")[0] for word in settings} <= {"total_steps"}
+        assert {word.split("=")[0] for word in settings} <= {"total_steps", "env.pickle"}
     elif name in ("matd3_jax.sweep", "benchmarks.sweep"):
         assert sweep.read(settings, getattr(options, "samples", None), 0)[1] or not settings
     else:
@@ -117,7 +117,9 @@ def test_python_parses(name):
         assert block.language in ("python", "sh", "diff", "yaml", "text"), f"{name}:{block.line}: {block.language!r}"
 
 
-@pytest.mark.parametrize("name", ["README.md", "docs/environments.md", "docs/running.md", "docs/sweeps.md"])
+@pytest.mark.parametrize(
+    "name", ["README.md", "docs/environments.md", "docs/interop.md", "docs/running.md", "docs/sweeps.md"]
+)
 def test_python_runs(name, tmp_path, monkeypatch):
     """Blocks of a document share their names. Trainings are shorter than they are written."""
     monkeypatch.chdir(tmp_path)

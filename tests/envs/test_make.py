@@ -22,7 +22,7 @@ def test_names_and_options():
         "num_adversaries": 3,
         "num_obstacles": 2,
     }
-    for name in names():
+    for name in [name for name in names() if "id" not in options(name)]:
         defaults = options(name)
         assert make(name) == make(name, **defaults)
         assert make(name).episode_length == defaults["episode_length"]

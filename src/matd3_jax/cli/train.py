@@ -12,6 +12,9 @@ from matd3_jax.runtime import devices, multihost, slurm
 from matd3_jax.runtime.terminal import say
 from matd3_jax.training.recording import Recorded, Recorder
 
+UNPICKLE = "env.pickle=true"
+"""Given with resume=, it says that environments which the run pickled are to be trusted."""
+
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit code."""
@@ -31,7 +34,8 @@ def main(argv: Sequence[str]) -> int:
             recorder.say(f"evaluate with: {command.line('matd3_jax.evaluate', run=path)}")
             return command.DIVERGED if everywhere else 0
         step = recorded.training.step(outcome.state)
-        line = command.line("matd3_jax.train", resume=path)
+        trusted = [UNPICKLE] if recorded.training.config.env.get("pickle") is True else []
+        line = command.line("matd3_jax.train", *trusted, resume=path)
         if outcome.stopped is None:
             recorder.say(f"stopped at env step {step:,} since a seed diverged; resume with: {line}")
             return command.DIVERGED
@@ -41,7 +45,9 @@ def main(argv: Sequence[str]) -> int:
 
 def _train(recorder: Recorder, given: arguments.Train) -> Recorded:
     if given.resume is not None:
-        return recorder.resume(given.resume, given.checkpoint, _total_steps(given.settings))
+        settings = [text for text in given.settings if text != UNPICKLE]
+        unpickle = len(settings) < len(given.settings)
+        return recorder.resume(given.resume, given.checkpoint, _total_steps(settings), unpickle=unpickle)
     if given.checkpoint is not None:
         raise UserError("checkpoint= goes with resume=RUN_DIR")
     settings = config.load(given.settings, arguments.TRAIN.keys)
@@ -53,7 +59,10 @@ def _total_steps(overrides: Sequence[str]) -> int | None:
     """The one setting that a resumed run may change."""
     for text in overrides:
         if options.key(text) != "total_steps":
-            raise UserError(f"cannot take {text!r} with resume=: a run keeps its settings; only total_steps may change")
+            raise UserError(
+                f"cannot take {text!r} with resume=: a run keeps its settings; only total_steps may change, and "
+                f"{UNPICKLE} says that its pickled environments are to be trusted"
+            )
     value = next((override.value() for override in reversed(config.parse(overrides))), None)
     if value is None:
         return None

@@ -21,13 +21,13 @@ from matd3_jax.errors import OptionError, UserError, nearest
 from matd3_jax.groups import GROUPS, known_names
 from matd3_jax.runtime import files
 
+FREE = ("env", "kwargs")
+"""A group of settings whose keys are not ours."""
+
 DEEPEST, LARGEST_FILE = 20, 10**6
 """Groups within each other, and characters, of a file of settings that is read."""
 
 _MALFORMED = (yaml.YAMLError, OmegaConfBaseException)
-
-OPEN = ("env.kwargs",)
-"""Groups that take any keys: options of other libraries' environments."""
 
 ROBOT_RECIPE = "fast"
 """What robots train by unless a recipe is given, on every machine."""
@@ -66,7 +66,8 @@ def load(overrides: Sequence[str] = (), known: Sequence[str] = ()) -> Config:
         lines.append(f"+algo@adversary={adversary[-1]}")
     try:
         tree = _files(tuple(lines))
-        if "robot" in tree and (tree.robot is True or recipe):
+        # `robot: false`: it may be one.
+        if tree.get("robot") or (recipe and recipe[-1] != "paper" and "robot" in tree):
             lines.append(f"+recipe={recipe[-1] if recipe else ROBOT_RECIPE}")
         elif recipe and recipe[-1] != "paper":
             raise UserError(f"recipe={recipe[-1]} is for robots; {tree.env.name} has the paper's settings only")
@@ -74,9 +75,6 @@ def load(overrides: Sequence[str] = (), known: Sequence[str] = ()) -> Config:
         _check_keys(tree, values, known)
         tree = copy.deepcopy(_files(tuple(lines)))
         for override in values:
-            if _is_open(override.key_or_group):
-                OmegaConf.update(tree, override.key_or_group, override.value(), merge=True, force_add=True)
-                continue
             if override.is_add() and not override.is_force_add():
                 raise UserError(f"cannot add {_line(override)!r}: the key is there, write it without the +")
             _update(tree, override)
@@ -237,6 +235,8 @@ def _check_keys(tree: DictConfig, values: Sequence[Override], known: Sequence[st
     """Raise UserError for a value whose key the configuration does not have; `known`: others that there are."""
     for override in values:
         node, path = tree, override.key_or_group.split(".")
+        if tuple(path[:2]) == FREE and isinstance(OmegaConf.select(tree, ".".join(FREE)), DictConfig):
+            continue
         for depth, name in enumerate(path):
             if not isinstance(node, DictConfig) or name not in node:
                 prefix = ".".join(path[:depth])
@@ -255,19 +255,13 @@ def _check_keys(tree: DictConfig, values: Sequence[Override], known: Sequence[st
                     f"there is no key {override.key_or_group!r}{f' (in {prefix})' if prefix else ''}; {hint}"
                 )
             node = node[name] if OmegaConf.is_config(node) and not OmegaConf.is_missing(node, name) else node
-            if ".".join(path[: depth + 1]) in OPEN:
-                break
-
-
-def _is_open(key: str) -> bool:
-    return any(f"{key}.".startswith(f"{group}.") for group in OPEN)
 
 
 def _update(tree: DictConfig, override: Override) -> None:
     """Give a key its value; keys of a group that the value lacks stay as they are."""
     key, value = override.key_or_group, override.value()
     both = isinstance(value, Mapping) and isinstance(OmegaConf.select(tree, key), DictConfig)
-    OmegaConf.update(tree, key, value, merge=both)
+    OmegaConf.update(tree, key, value, merge=both, force_add=True)  # of keys that are not ours, too
 
 
 def _is_text(override: Override) -> bool:

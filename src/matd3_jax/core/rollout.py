@@ -105,7 +105,10 @@ def collect(
         before = carry.state if keep_states else None
         quantile = 0.5 if carry.noise_quantile is None else carry.noise_quantile
         action = layout.join_actions(draws) if random else act(layout, policy, carry.observation, draws, quantile)
-        after = jax.vmap(env.step)(step_keys, carry.state, env_actions(layout, action))
+        if env.on_host:
+            after, *fresh = jax.vmap(env.step_or_reset)(step_keys, fresh, carry.state, env_actions(layout, action))
+        else:
+            after = jax.vmap(env.step)(step_keys, carry.state, env_actions(layout, action))
         x, next_x = (jnp.concatenate(o, axis=-1) for o in (carry.observation, after.observation))
         rows = layout.pack_rows(x, action, after.reward, next_x, after.terminated, after.truncated)
         returns = carry.episode_return + after.reward
@@ -125,7 +128,8 @@ def collect(
 
     step_keys, reset_keys = (jax.random.split(k, (length, num_envs)) for k in (step_key, reset_key))
     # Every step has a fresh start at hand, drawn in one batch: inside the loop they would be as many, drawn one by one.
-    fresh = jax.vmap(jax.vmap(env.reset))(reset_keys)
+    # Not on the host, where each reset would be made: there they are made where they are needed.
+    fresh = reset_keys if env.on_host else jax.vmap(jax.vmap(env.reset))(reset_keys)
     fresh_quantiles = None
     if env_state.noise_quantile is not None:
         shape = (length, *env_state.noise_quantile.shape)

@@ -1,4 +1,4 @@
-"""Environments in pure JAX under one contract (`environment.Environment`); made by name with `make`.
+"""Environments under one contract (`environment.Environment`), nearly all in pure JAX; made by name with `make`.
 
 Importing this package loads no environment: each is imported when it is first asked for.
 """
@@ -22,7 +22,9 @@ __all__ = [
     "Simplex",
     "TimeStep",
     "check",
-    "foreign",
+    "from_gymnasium",
+    "from_jaxmarl",
+    "from_pettingzoo",
     "make",
     "names",
     "options",
@@ -51,23 +53,16 @@ _CLASSES = {
     "brax_walker2d": (".robots.brax", "BraxWalker2d"),
     "brax_humanoid": (".robots.brax", "BraxHumanoid"),
     "brax_swimmer": (".robots.brax", "BraxSwimmer"),
-}
-
-_FOREIGN = {
+    "pettingzoo": (".host.parallel", "PettingZoo"),
+    "gymnasium": (".host.single", "Gymnasium"),
     "jaxmarl": ("..interop.from_jaxmarl", "JaxMARLTask"),
     "playground": ("..interop.from_playground", "PlaygroundTask"),
 }
-"""Environments of other libraries, whose option `id` names one of theirs: they need extras."""
 
 
 def names() -> tuple[str, ...]:
-    """Names `make` knows, but for those of `foreign`."""
+    """Names `make` knows."""
     return tuple(_CLASSES)
-
-
-def foreign() -> tuple[str, ...]:
-    """Names `make` knows that stand for the environments of another library, chosen by the option `id`."""
-    return tuple(_FOREIGN)
 
 
 def options(name: str) -> dict[str, Any]:
@@ -97,9 +92,72 @@ def make(name: str, **options_: Any) -> Environment:
     return _find(name)(**options_)
 
 
+def from_pettingzoo(source: Any, **options_: Any) -> Environment:
+    """Take an environment with PettingZoo's parallel API.
+
+    Args:
+        source: a function that makes one, or an instance, which is copied: every seed has copies of its own.
+        options_: `adversaries`, `shared_reward`, `episode_length`, `pickle` (see `host.parallel.PettingZoo`).
+
+    Raises OptionError for what has no parallel API, cannot be copied, or has other spaces than these.
+
+    Example:
+        >>> from mpe2 import simple_push_v3
+        >>> env = from_pettingzoo(lambda: simple_push_v3.parallel_env(max_cycles=10))
+        >>> env.teams, env.observation_sizes, env.episode_length
+        (('adversaries', 'agents'), (8, 19), 10)
+    """
+    from matd3_jax.envs.host.parallel import PettingZooObject
+
+    return _with_options(PettingZooObject, source, options_)
+
+
+def from_gymnasium(source: Any, **options_: Any) -> Environment:
+    """Take an environment of gymnasium, its action vector shared out among agents.
+
+    Args:
+        source: a function that makes one, or an instance, which is copied: every seed has copies of its own.
+        options_: `split`, `observation`, `episode_length`, `pickle` (see `host.single.Gymnasium`).
+
+    Raises OptionError for what is no environment of gymnasium, cannot be copied or shared so, or has other spaces.
+
+    Example:
+        >>> import gymnasium
+        >>> env = from_gymnasium(lambda: gymnasium.make("Reacher-v5"), split="2x1")
+        >>> env.agents, env.action_spaces[0]
+        (('agent_0', 'agent_1'), Box(size=1, low=-1.0, high=1.0))
+    """
+    from matd3_jax.envs.host.single import GymnasiumObject
+
+    return _with_options(GymnasiumObject, source, options_)
+
+
+def from_jaxmarl(env: Any, **options_: Any) -> Environment:
+    """Take an environment of JaxMARL, an instance of its `MultiAgentEnv`.
+
+    `options_`: `episode_length` (see `interop.from_jaxmarl.FromJaxMARL`).
+
+    Raises OptionError for what does not have its methods or spaces, or has no time limit and is given none.
+
+    Example:
+        >>> import jaxmarl  # doctest: +SKIP
+        >>> env = from_jaxmarl(jaxmarl.make("MPE_simple_tag_v3"))  # doctest: +SKIP
+    """
+    from matd3_jax.interop.from_jaxmarl import FromJaxMARL
+
+    return _with_options(FromJaxMARL, env, options_)
+
+
+def _with_options(class_: Any, source: Any, given: dict[str, Any]) -> Environment:
+    known = [field.name for field in dataclasses.fields(class_) if field.name != "source"]
+    for key in given:
+        if key not in known:
+            raise OptionError(f"there is no option {key!r}; {nearest(key, known)}")
+    return class_(source=source, **given)
+
+
 def _find(name: str) -> Any:
-    known = _CLASSES | _FOREIGN
-    if name not in known:
-        raise OptionError(f"no environment is called {name!r}; {nearest(name, known)}")
-    module, class_ = known[name]
+    if name not in _CLASSES:
+        raise OptionError(f"no environment is called {name!r}; {nearest(name, _CLASSES)}")
+    module, class_ = _CLASSES[name]
     return getattr(importlib.import_module(module, __name__), class_)

@@ -4,6 +4,7 @@ import abc
 from typing import Any, NamedTuple
 
 import chex
+import jax
 import jax.numpy as jnp
 
 from matd3_jax.envs.spaces import ActionSpace
@@ -86,6 +87,29 @@ class Environment(abc.ABC):
     @abc.abstractmethod
     def step(self, key: chex.PRNGKey, state: Any, action: tuple[chex.Array, ...]) -> TimeStep:
         """Let all agents act once. `action`: one element of `action_spaces[i]` per agent."""
+
+    @property
+    def on_host(self) -> bool:
+        """Whether it is stepped in Python on the host, and its states are references to objects there.
+
+        Such states go forward only, and mean nothing in another process (see `envs.host`).
+        """
+        return False
+
+    def step_or_reset(
+        self, key: chex.PRNGKey, reset_key: chex.PRNGKey, state: Any, action: tuple[chex.Array, ...]
+    ) -> tuple[TimeStep, Any, tuple[chex.Array, ...]]:
+        """`step`, then the state and the observations to go on from: those of `reset` where the episode ended.
+
+        What the training loop calls of environments `on_host`, which reset only where they have to; of others it resets
+        whole batches beforehand, which is quicker in a compiled program.
+        """
+        after = self.step(key, state, action)
+        ended = after.terminated | after.truncated
+        going = jax.tree.map(
+            lambda new, old: jnp.where(ended, new, old), self.reset(reset_key), (after.state, after.observation)
+        )
+        return after, *going
 
     @abc.abstractmethod
     def observe(self, state: Any) -> tuple[chex.Array, ...]:

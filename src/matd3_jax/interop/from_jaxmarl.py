@@ -1,25 +1,23 @@
 """Environments of JaxMARL as environments here: `env=jaxmarl env.id=MPE_simple_spread_v3`, or any instance of one."""
 
 import abc
-import contextlib
 import dataclasses
 import functools
-import io
-import sys
 from collections.abc import Mapping
 from typing import Any, NamedTuple
-from unittest import mock
 
 import chex
 import jax
 import jax.numpy as jnp
 
 from matd3_jax.envs.environment import Environment, TimeStep, check_count
+from matd3_jax.envs.host.sources import Kwargs
 from matd3_jax.envs.robots.quiet import quiet, quiet_mujoco
 from matd3_jax.envs.spaces import ActionSpace
 from matd3_jax.errors import OptionError, nearest
+from matd3_jax.interop.foreign_states import flat, like, raw
+from matd3_jax.interop.import_jaxmarl import import_jaxmarl
 from matd3_jax.interop.jaxmarl_facts import Facts, facts
-from matd3_jax.interop.plain import flat, like, options_of, raw, thawed
 
 MABRAX = ("ant_4x2", "halfcheetah_6x1", "hopper_3x1", "humanoid_9|8", "walker2d_2x3")
 """Ids of JaxMARL's environments in brax, which reset by themselves unless they are told not to."""
@@ -126,7 +124,7 @@ class _JaxMARLEnvironment(Environment):
 
 @dataclasses.dataclass(frozen=True)
 class FromJaxMARL(_JaxMARLEnvironment):
-    """`env`, an instance of JaxMARL's `MultiAgentEnv` (or of what has its methods), as an environment here.
+    """`source`, an instance of JaxMARL's `MultiAgentEnv` (or of what has its methods), as an environment here.
 
     Steps are those of `step_env`, without JaxMARL's automatic reset. An episode ends for all agents at once, when the
     environment says so of "__all__": an agent that is done earlier stays until then. Observations become vectors of
@@ -135,54 +133,42 @@ class FromJaxMARL(_JaxMARLEnvironment):
     state where there is one. Agents that it calls adversaries are in the team "adversaries". A team's return is the
     mean of its agents', as JaxMARL's `LogWrapper` gives them.
 
-    JaxMARL has one `done` for termination and time limit. Here `truncated` is what its time limit alone ended: by
-    "truncation" or "truncated" in its infos, where they are there (MABrax); else by asking the same environment without
-    its `max_steps` whether it would have ended (MPE, JaxNav, SMAX, Overcooked: MPE's never would); else whatever ends at
-    `episode_length` or after.
+    JaxMARL has one `done` for termination and time limit. Here `truncated` is what its time limit alone ended. That is
+    known by "truncation" or "truncated" in its infos, where they are there (MABrax); else the same environment without
+    its `max_steps` is asked whether it would have ended, too (MPE's never would; JaxNav, SMAX, Overcooked); else
+    whatever ends at `episode_length` or after is truncated.
 
-    Args:
-        env: the environment.
-        limit: env steps after which episodes are truncated; default: by the environment's own time limit (MPE's
-            `max_steps=25` are 26 steps, as it counts from 0).
+    `episode_length`: env steps after which episodes are truncated; None: the environment's own time limit (MPE's
+    `max_steps=25` are 26 steps, as it counts from 0).
 
-    Raises OptionError where `env` does not have these methods or spaces, resets by itself (MABrax: make it with
+    Raises OptionError where `source` does not have these methods or spaces, resets by itself (MABrax: make it with
     auto_reset=False), or has no time limit and is given none.
-
-    Example:
-        >>> import jaxmarl  # doctest: +SKIP
-        >>> env = FromJaxMARL(jaxmarl.make("MPE_simple_tag_v3"))  # doctest: +SKIP
     """
 
-    env: Any
-    limit: int | None = None
+    source: Any
+    episode_length: int | None = None  # type: ignore[assignment,misc]  # a field in place of the property
 
     def __post_init__(self) -> None:
-        _limit(self.wrapped, self.limit)
+        object.__setattr__(self, "episode_length", _limit(self.source, self.episode_length))
 
     @property
     def wrapped(self) -> Any:
-        return self.env
-
-    @property
-    def episode_length(self) -> int:
-        return _limit(self.wrapped, self.limit)
+        return self.source
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class JaxMARLTask(_JaxMARLEnvironment):
     """The environment that JaxMARL registers as `id`, made with the options `kwargs`: see `FromJaxMARL`.
 
-    `episode_length`: as `FromJaxMARL.limit`; None: the environment's own.
-
     Raises OptionError for an unknown id, for options that it does not take, and where JaxMARL is not installed.
     """
 
-    id: str = "MPE_simple_spread_v3"
-    kwargs: Any = dataclasses.field(default=())
+    id: str | None = None
+    kwargs: Mapping[str, Any] = Kwargs({})
     episode_length: int | None = None  # type: ignore[assignment,misc]  # a field in place of the property
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "kwargs", options_of("kwargs", self.kwargs or {}))
+        object.__setattr__(self, "kwargs", Kwargs(self.kwargs))
         object.__setattr__(self, "episode_length", _limit(self.wrapped, self.episode_length))
 
     @property
@@ -190,33 +176,22 @@ class JaxMARLTask(_JaxMARLEnvironment):
         return _make(self.id, self.kwargs)
 
 
-def import_jaxmarl() -> Any:
-    """The module jaxmarl, which prints while it is imported. Raises OptionError where it is missing."""
-    try:
-        # JaxMARL's import prints, and leaves sys.stdout and sys.stderr as sys.__stdout__ and sys.__stderr__.
-        with quiet(), mock.patch.object(sys, "__stdout__", io.StringIO()), contextlib.redirect_stderr(sys.stderr):
-            import jaxmarl
-    except ImportError as error:
-        raise OptionError(f"env=jaxmarl needs the extra 'jaxmarl': pip install 'matd3_jax[jaxmarl]' ({error})") from error
-    return jaxmarl
-
-
-@functools.lru_cache(maxsize=None)
-def _make(id: str, kwargs: Mapping[str, Any]) -> Any:
+@functools.cache
+def _make(id: str | None, kwargs: Kwargs) -> Any:
     """The environment, its arrays made outside whatever is being traced: they outlive it."""
-    jaxmarl = import_jaxmarl()
+    jaxmarl = import_jaxmarl("env=jaxmarl")
+    if id is None:
+        raise OptionError("env=jaxmarl needs an id as jaxmarl.make takes it, for instance env.id=MPE_simple_spread_v3")
     known = list(jaxmarl.registered_envs)
     if id not in known:
-        raise OptionError(f"id={id!r}: JaxMARL has no such environment; {nearest(id, known)}")
-    given = thawed(kwargs)
-    if id in MABRAX:
-        given = {"auto_reset": False, **given}
+        raise OptionError(f"env.id={id}: JaxMARL has no such environment; {nearest(id, known)}")
+    given = {"auto_reset": False, **kwargs} if id in MABRAX else dict(kwargs)
     try:
         with quiet(), quiet_mujoco(), jax.ensure_compile_time_eval():
             return jaxmarl.make(id, **given)
     except Exception as error:  # whatever its constructor raises for options that it does not take
         words = " ".join(str(error).split())
-        raise OptionError(f"id={id!r}: JaxMARL cannot make it with kwargs={given}: {words}") from error
+        raise OptionError(f"env.id={id}: JaxMARL cannot make it with kwargs={given}: {words}") from error
 
 
 def _limit(env: Any, given: int | None) -> int:

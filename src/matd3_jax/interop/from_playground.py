@@ -15,10 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from matd3_jax.envs.environment import LIMIT, Environment, TimeStep, check_choice, check_count
+from matd3_jax.envs.host.sources import Kwargs
 from matd3_jax.envs.robots.quiet import quiet, quiet_mujoco
 from matd3_jax.envs.spaces import Box
 from matd3_jax.errors import OptionError, nearest
-from matd3_jax.interop.plain import flat, like, options_of, raw, thawed
+from matd3_jax.interop.foreign_states import flat, like, raw
 from matd3_jax.interop.playground_layout import owners
 from matd3_jax.interop.playground_split import Split, as_split, share_out
 from matd3_jax.runtime.terminal import say
@@ -38,9 +39,9 @@ class PlaygroundTask(Environment):
     """The task that MuJoCo Playground registers as `id`, its actuators shared out among agents.
 
     All agents share the task's reward. `split` says who moves what: see `playground_split.share_out`. Actions are in
-    [-1, 1] for each actuator, as the tasks take them. With `view="own"` an agent sees what belongs to its own actuators
-    (positions and velocities of their joints, its last action) and all that belongs to none, where the layout of the
-    observation is known (`playground_layout.LAYOUTS`), and everything where it is not; with `view="all"` everything.
+    [-1, 1] for each actuator, as the tasks take them. With `observation="own"` an agent sees what belongs to its own
+    actuators (positions and velocities of their joints, its last action) and all that belongs to none, where the layout
+    of the observation is known (`playground_layout.LAYOUTS`), and everything where it is not; with "all" everything.
     Where a task has an observation of its own for critics ("privileged_state"), that is the full observation, otherwise
     the task's observation is.
 
@@ -61,18 +62,18 @@ class PlaygroundTask(Environment):
         ('agent_0', 'agent_1')
     """
 
-    id: str = "CheetahRun"
+    id: str | None = None
     split: Split = "halves"
-    view: str = "own"
+    observation: str = "own"
     impl: str = "jax"
-    kwargs: Any = ()
+    kwargs: Mapping[str, Any] = Kwargs({})
     episode_length: int | None = None  # type: ignore[assignment,misc]  # a field in place of the property
 
     def __post_init__(self) -> None:
-        check_choice("view", self.view, ("own", "all"))
+        check_choice("observation", self.observation, ("own", "all"))
         check_choice("impl", self.impl, ("jax", "warp"))
         object.__setattr__(self, "split", as_split(self.split))
-        object.__setattr__(self, "kwargs", options_of("kwargs", self.kwargs or {}))
+        object.__setattr__(self, "kwargs", Kwargs(self.kwargs))
         length = self._loaded.episode_length if self.episode_length is None else self.episode_length
         check_count("episode_length", length, 1)
         object.__setattr__(self, "episode_length", length)
@@ -100,7 +101,7 @@ class PlaygroundTask(Environment):
     def seen(self) -> tuple[np.ndarray, ...]:
         """Of each agent the indices of the entries of the task's observation that it sees."""
         loaded = self._loaded
-        whose = (None,) * loaded.observation_size if self.view == "all" else loaded.owners
+        whose = (None,) * loaded.observation_size if self.observation == "all" else loaded.owners
         if whose is None:
             whose = (None,) * loaded.observation_size
         return tuple(
@@ -151,7 +152,7 @@ class PlaygroundTask(Environment):
         return state, self.observe(state)
 
     def step(self, key: chex.PRNGKey, state: PlaygroundState, action: tuple[chex.Array, ...]) -> TimeStep:
-        """All agents act once. What is random comes from the key that the task keeps in its state; `key` is not used."""
+        """All agents act once; what is random comes from the key in the task's own state, `key` is not used."""
         del key
         order = np.argsort(np.concatenate(self.actuators))
         control = jnp.concatenate(action)[order]
@@ -229,16 +230,18 @@ def bodies(mj_model: Any) -> dict[int, int]:
     return {i: int(mj_model.jnt_bodyid[joints[i]]) for i in range(mj_model.nu) if moves_joint[i]}
 
 
-@functools.lru_cache(maxsize=None)
-def _load(id: str, impl: str, kwargs: Mapping[str, Any]) -> Loaded:
+@functools.cache
+def _load(id: str | None, impl: str, kwargs: Kwargs) -> Loaded:
     """Make a task, its arrays outside whatever is being traced: they outlive it."""
     registry = import_registry()
+    if id is None:
+        raise OptionError("env=playground needs an id, the name of a task, for instance env.id=CheetahRun")
     if id not in registry.ALL_ENVS:
-        raise OptionError(f"id={id!r}: Playground has no such task; {nearest(id, registry.ALL_ENVS)}")
+        raise OptionError(f"env.id={id}: Playground has no such task; {nearest(id, registry.ALL_ENVS)}")
     downloads = id not in registry.dm_control_suite.ALL_ENVS
     if downloads and not _menagerie().exists():
         say(f"MuJoCo Playground downloads the robots' models (mujoco_menagerie), once, into {_menagerie()}")
-    changes = {"impl": impl} | dict(_flattened(thawed(kwargs, list)))
+    changes = {"impl": impl} | dict(_flattened(kwargs))
     try:
         with quiet(), quiet_mujoco(), contextlib.redirect_stderr(io.StringIO()), jax.ensure_compile_time_eval():
             env = registry.load(id, config_overrides=changes)
@@ -248,13 +251,13 @@ def _load(id: str, impl: str, kwargs: Mapping[str, Any]) -> Loaded:
         words = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
         if downloads and not _menagerie().exists():
             raise OptionError(
-                f"id={id!r} needs the robots' models, which Playground could not download ({words}): git clone "
+                f"env.id={id} needs the robots' models, which Playground could not download ({words}): git clone "
                 f"https://github.com/google-deepmind/mujoco_menagerie {_menagerie()}"
             ) from error
-        raise OptionError(f"id={id!r}: Playground cannot make it with {changes}: {words}") from error
+        raise OptionError(f"env.id={id}: Playground cannot make it with {changes}: {words}") from error
     shown = state.obs["state"] if isinstance(state.obs, Mapping) and "state" in state.obs else state.obs
     if isinstance(shown, Mapping):
-        raise OptionError(f"id={id!r}: its observation has no 'state' but {', '.join(shown)}: pictures are not taken")
+        raise OptionError(f"env.id={id}: its observation has no 'state' but {', '.join(shown)}: pictures are not taken")
     config = registry.get_default_config(id)
     for key, value in changes.items():
         config.update_from_flattened_dict({key: value})

@@ -16,8 +16,8 @@ TOLERANCE = 1e-4
 class SimplexSpace(gymnasium.spaces.Box):
     """`envs.Simplex` as a gymnasium space: vectors of soft choices, each of which is at least 0 and sums to 1.
 
-    It is a `Box` from 0 to 1 for whoever only asks for shape and bounds; `contains` also asks for the sums, and `sample`
-    draws as `envs.Simplex.sample` does. `batch`: that many vectors, [batch, entries]; None: one, [entries].
+    It is a `Box` from 0 to 1 for whoever asks for shape and bounds alone; `contains` also asks for the sums, and
+    `sample` draws as `envs.Simplex.sample` does. `batch`: that many vectors, [batch, entries]; None: one, [entries].
     """
 
     def __init__(self, sizes: tuple[int, ...], batch: int | None = None, seed: Any = None):

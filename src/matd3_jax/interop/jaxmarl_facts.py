@@ -57,7 +57,7 @@ class Facts:
     """The same environment without its time limit; None: it cannot be taken away."""
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def facts(env: Any) -> Facts:
     """Trace `env` once; nothing is computed. Raises OptionError where it lacks what JaxMARL's environments have."""
     name = type(env).__name__
@@ -132,7 +132,9 @@ def _action(agent: str, space: Any) -> Action:
         if (low == low[0]).all() and (high == high[0]).all():
             return Action(Box(low.size, float(low[0]), float(high[0])), shape)
         return Action(Box(low.size, -1.0, 1.0), shape, (low.astype(np.float32), high.astype(np.float32)))
-    raise OptionError(f"the action space of {agent!r} is a {type(space).__name__}: must be Box, Discrete, MultiDiscrete")
+    raise OptionError(
+        f"the action space of {agent!r} is a {type(space).__name__}: must be Box, Discrete, MultiDiscrete"
+    )
 
 
 def _teams(env: Any, agents: tuple[str, ...]) -> tuple[str, ...]:

@@ -65,9 +65,7 @@ class ParallelEnvironment(ParallelEnv):
 
     def step(
         self, actions: dict[str, Any]
-    ) -> tuple[
-        dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
-    ]:
+    ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """(observations, rewards, terminations, truncations, infos). Raises UserError where an agent does not act."""
         if not self.agents:
             raise UserError("step: the episode is over; call reset first")

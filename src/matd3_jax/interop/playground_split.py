@@ -91,7 +91,9 @@ def _grouped(actuators: Sequence[str], group: Callable[[str], str | None], noun:
     for i, name in enumerate(actuators):
         found = group(name)
         if found is None:
-            raise OptionError(f"split='{noun}s': the name of actuator {name!r} says no {noun}; take NxM or lists of names")
+            raise OptionError(
+                f"split='{noun}s': the name of actuator {name!r} says no {noun}; take NxM or lists of names"
+            )
         members.setdefault(found, []).append(i)
     return tuple(map(tuple, members.values()))
 

@@ -38,8 +38,8 @@ class VectorEnvironment(gymnasium.vector.VectorEnv):
     ):
         if len(env.agents) != 1:
             raise UserError(
-                f"{type(env).__name__} has {len(env.agents)} agents, and gymnasium's environments have one: take a robot "
-                "with split='single', or joint=True for all agents as one"
+                f"{type(env).__name__} has {len(env.agents)} agents, and gymnasium's environments have one: take a "
+                "robot with split='single', or joint=True for all agents as one"
             )
         if not isinstance(num_envs, int) or num_envs < 1:
             raise UserError(f"num_envs={num_envs!r}: must be a whole number of at least 1")
@@ -87,7 +87,9 @@ class VectorEnvironment(gymnasium.vector.VectorEnv):
             raise UserError("step: call reset first")
         taken = as_ours(self.env.action_spaces[0], actions)
         if taken.shape != self.action_space.shape:
-            raise UserError(f"step: actions have the shape {list(taken.shape)}; must be {list(self.action_space.shape or ())}")
+            raise UserError(
+                f"step: actions have the shape {list(taken.shape)}; must be {list(self.action_space.shape or ())}"
+            )
         over = self._over
         if self.autoreset_mode == AutoresetMode.DISABLED and over.any():
             raise UserError(f"step: copies {np.flatnonzero(over).tolist()} have ended; reset them (reset_mask)")

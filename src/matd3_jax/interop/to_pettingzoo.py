@@ -33,7 +33,9 @@ def parallel_env(
     try:
         from matd3_jax.interop.parallel_environment import ParallelEnvironment
     except ImportError as error:
-        raise UserError(f"parallel_env needs the extra 'pettingzoo': pip install 'matd3_jax[pettingzoo]' ({error})") from error
+        raise UserError(
+            f"parallel_env needs the extra 'pettingzoo': pip install 'matd3_jax[pettingzoo]' ({error})"
+        ) from error
     return ParallelEnvironment(resolve(env, options), render_mode, size)
 
 

@@ -7,12 +7,17 @@ import traceback
 import matd3_jax
 
 _IN_A_MESSAGE = re.compile(r"os_error_code='(\d+)'")
+_ON_HOST = re.compile(r"\bHostError: (.*)")
+"""How JAX passes on what an environment on the host raised while a compiled program ran."""
 _FILE = re.compile(r'Failed \w+: "([^"]+)"')
 """How tensorstore, which writes checkpoints, passes an error of the system on, and which file it names."""
 
 
 def describe(error: BaseException) -> str | None:
     """What happened, and what to do about it; None for what can only be a fault of the program."""
+    on_host = _ON_HOST.search(str(error))
+    if on_host:
+        return on_host[1]
     text = " ".join(str(error).split())
     if isinstance(error, OSError):
         return _of_the_system(error, text)

@@ -24,7 +24,7 @@ from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.runtime.terminal import say
 from matd3_jax.sweep import batching
-from matd3_jax.training import checkpoint, finish
+from matd3_jax.training import checkpoint, finish, host_states
 from matd3_jax.training import run as training_run
 from matd3_jax.training.loggers import DivergenceLogger, Logger, TableLogger, TensorBoardLogger
 from matd3_jax.training.memory import most_seeds, needed
@@ -253,6 +253,8 @@ class Batch:
                 self.watch.log(row)
             return state, row, True
         saved = Path(broadcast(str(checkpoint.verify(self.checkpoints)) if first else None))
+        for line in host_states.notes(saved, self.training.trainer, unpickle=False) if first else ():
+            say(line)
         state, done = checkpoint.restore(saved, self.training.trainer, self.training.share), int(saved.name)
         self.processes.barrier()
         for run, config, own in zip(self.runs, self.members, self.seeds, strict=True) if first else ():

@@ -1,7 +1,8 @@
 """Checkpoints: everything a run carries, written with Orbax, checked by checksum before it is read back.
 
 Layout of one: `STEP/state` (all but the replay; several processes write `STEP/state/FIRST`, each its seeds, from number
-FIRST on), `STEP/replay/SEED` (the rows filled so far; none in what a sweep leaves of its runs), `STEP/checksums.json`.
+FIRST on), `STEP/replay/SEED` (the rows filled so far; none in what a sweep leaves of its runs), `STEP/host/SEED` (of
+environments on the host that are pickled), `STEP/checksums.json`.
 A checkpoint appears under its name only when it is whole. The replay is written and read one seed at a time, so that it
 never stands in memory twice. What some processes wrote any other number of them can read.
 """
@@ -27,6 +28,7 @@ from matd3_jax.core import replay
 from matd3_jax.errors import UserError
 from matd3_jax.runtime import files
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Share
+from matd3_jax.training import host_states
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.state import TrainState
 
@@ -81,6 +83,8 @@ def save(
             written.append(partial_ / "replay" / str(share.first + seed))
             checkpointer.save(there / written[-1].relative_to(partial_), {"rows": rows})
             checkpointer.wait_until_finished()
+    if seeds is None:
+        written += host_states.save(partial_, trainer, state, share)
     parts = processes.gather_messages(json.dumps(_checksums(partial_, written)).encode())
     if processes.first:
         checksums = dict(sorted(pair for part in parts for pair in json.loads(part).items()))
@@ -184,11 +188,14 @@ def damage(path: Path) -> str | None:
         return "checksums.json"
 
 
-def restore(path: Path, trainer: TrainLoop, share: Share | None = None) -> TrainState:
+def restore(path: Path, trainer: TrainLoop, share: Share | None = None, unpickle: bool = False) -> TrainState:
     """The state in the checkpoint at `path`, as `verify` gave it. Raises UserError if it holds no replay or does not
     fit the trainer.
 
-    share: which of the checkpoint's seeds the trainer has; None: all.
+    Args:
+        share: which of the checkpoint's seeds the trainer has; None: all.
+        unpickle: let environments on the host go on from their pickles, where there are any; what is unpickled can run
+            any program. Otherwise they start new episodes.
     """
     if not (path / "replay").is_dir():
         raise UserError(f"{path} holds no replay: what a sweep leaves of a run can be evaluated, not resumed")
@@ -210,7 +217,7 @@ def restore(path: Path, trainer: TrainLoop, share: Share | None = None) -> Train
             local.append(rows)
     shape = (trainer.sharding.padded_seeds, trainer.schedule.replay_capacity, trainer.layout.row_size)
     rows = jax.make_array_from_single_device_arrays(shape, trainer.shardings.replay, local)
-    return small._replace(replay=rows)
+    return host_states.restored(path, trainer, small._replace(replay=rows), share, unpickle)
 
 
 def restore_actors(path: Path, trainer: TrainLoop) -> TrainState:

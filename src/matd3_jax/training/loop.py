@@ -14,7 +14,7 @@ from matd3_jax.core import minibatch, n_step, q_bias, replay, rollout, running_s
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.q_bias import Pairs
-from matd3_jax.core.rollout import Episodes, PolicyParams
+from matd3_jax.core.rollout import EnvState, Episodes, PolicyParams
 from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.core.update import UpdateMetrics
 from matd3_jax.envs.environment import Environment
@@ -65,6 +65,8 @@ class TrainLoop:
             delay = group.algorithm.policy_delay
             if updates % delay and delay % updates:
                 raise ValueError(f"updates_per_collect={updates} and policy_delay={delay}: one must divide the other")
+        if env.on_host:  # a seed's copies are stepped once: several devices would each step their own
+            devices_per_seed = 1
         sharding = SeedSharding(num_seeds, schedule.batch_size, devices, devices_per_seed, seeds_together)
         self.sharding, self.mesh, self.on_cpu = sharding, sharding.mesh, sharding.on_cpu
         per_group = [hyper[layout.teams[group.members[0]]] for group in layout.groups]
@@ -122,6 +124,17 @@ class TrainLoop:
         capacity = self.schedule.replay_capacity
         allocate = partial(replay.allocate, self.sharding.padded_seeds, capacity, self.layout.row_size)
         return state._replace(replay=jax.jit(allocate, out_shardings=self.shardings.replay)())
+
+    @cached_property
+    def fresh_environments(self) -> Callable[[TrainState], EnvState]:
+        """Make environments at the start of new episodes for each seed of a state, whose keys give them."""
+
+        def one(key):
+            apart = jax.random.fold_in(key, rollout.APART)
+            return rollout.start(self.env, apart, self.schedule.num_envs, rollout.ranged(self.layout))
+
+        start = jax.jit(self.sharding.sharded(jax.vmap(one), P("seeds"), P("seeds")))
+        return lambda state: start(state.key)
 
     def abstract_state(self) -> TrainState:
         """Shapes and types of the state, with an empty replay."""

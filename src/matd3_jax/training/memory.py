@@ -38,7 +38,8 @@ def parts(trainer: TrainLoop, seeds: int, episodes: int = 0) -> dict[str, Part]:
         episodes: of an evaluation.
     """
     devices = len(jax.local_devices())
-    each = idle_devices(devices, seeds, trainer.schedule.batch_size) if trainer.on_cpu else 1
+    shared = trainer.on_cpu and not trainer.env.on_host
+    each = idle_devices(devices, seeds, trainer.schedule.batch_size) if shared else 1
     shares = min(seeds, devices // each)
     rows = math.ceil(seeds / shares) * shares
     copies = each * rows  # a seed's state is on all the devices that work on it

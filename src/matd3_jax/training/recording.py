@@ -18,7 +18,7 @@ from matd3_jax.runs.divergence import Divergence
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
-from matd3_jax.training import announcement, checkpoint, finish
+from matd3_jax.training import announcement, checkpoint, finish, host_states
 from matd3_jax.training.loggers import DivergenceLogger, Logger, TableLogger, TensorBoardLogger, warn
 from matd3_jax.training.progress import ProgressBar
 from matd3_jax.training.run import Outcome, run
@@ -84,7 +84,12 @@ class Recorder:
             return self._from_the_start(training, directory, stop)
 
     def resume(
-        self, path: Path, step: int | None = None, total_steps: int | None = None, env: Environment | None = None
+        self,
+        path: Path,
+        step: int | None = None,
+        total_steps: int | None = None,
+        env: Environment | None = None,
+        unpickle: bool = False,
     ) -> Recorded:
         """Train a run on from its last checkpoint, or from that of env step `step`; from the start where it has none.
 
@@ -93,6 +98,7 @@ class Recorder:
         Args:
             total_steps: env steps of each seed from now on; None: as before.
             env: of a run whose environment was given as an object.
+            unpickle: of environments on the host (see `checkpoint.restore`).
 
         Raises UserError where there is no run, it has come to its end, or the checkpoint is damaged.
         """
@@ -114,7 +120,7 @@ class Recorder:
                     str(checkpoint.verify(directory.checkpoints, step)) if self.processes.first else None
                 )
             )
-            return self._from_checkpoint(training, directory, saved, stop)
+            return self._from_checkpoint(training, directory, saved, stop, unpickle)
 
     def _checked(self, settings: Config, env: Environment | None) -> TrainingSession:
         training = TrainingSession(settings, env, processes=self.processes)
@@ -165,7 +171,7 @@ class Recorder:
         return divergence.earliest(divergence.of_run(directory, step), found)
 
     def _from_checkpoint(
-        self, training: TrainingSession, directory: RunDirectory, saved: Path, stop: Stop | None
+        self, training: TrainingSession, directory: RunDirectory, saved: Path, stop: Stop | None, unpickle: bool
     ) -> Recorded:
         done = int(saved.name)
         row = {"step": np.array([done])}
@@ -186,7 +192,9 @@ class Recorder:
             for line in announcement.first_lines(training, directory, done):
                 self.say(line)
             self.say(f"resumed from the checkpoint of env step {done:,}")
-        state = checkpoint.restore(saved, training.trainer, training.share)
+            for line in host_states.notes(saved, training.trainer, unpickle):
+                (self.say if self.shows_progress else warn)(line)
+        state = checkpoint.restore(saved, training.trainer, training.share, unpickle)
         self.processes.barrier()  # the files are changed only when all have what they need
         if self.processes.first:
             checkpoint.set_aside_after(directory.checkpoints, done)

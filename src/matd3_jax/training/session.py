@@ -69,6 +69,11 @@ class TrainingSession:
         self.seeds = numbers[self.share.seeds]
         """[seeds] the number that each seed's key is made from."""
         base = envs.make(**config.env) if env is None else env
+        if base.on_host and config.diagnostics.q_bias:
+            raise UserError(
+                f"diagnostics.q_bias=true puts environments back to earlier states, and {config.env['name']} is "
+                "stepped in Python and only goes forward: leave it false"
+            )
         teams = config.teams()
         if config.adversary is not None and "adversaries" not in base.teams:
             raise UserError(f"adversary={config.adversary.name}: {config.env['name']} has no adversaries")

@@ -108,6 +108,7 @@ def resume(
     checkpoint: int | None = None,
     total_steps: int | None = None,
     env: Environment | None = None,
+    unpickle: bool = False,
     callback: Callable[[Row], None] | None = None,
     loggers: Sequence[Logger] = (),
 ) -> Result:
@@ -118,6 +119,8 @@ def resume(
         checkpoint: the env step of an older checkpoint to resume from.
         total_steps: env steps of each seed from now on; None: as before.
         env: the environment of a run that was given one as an object.
+        unpickle: let environments on the host go on from what the run pickled (`env.pickle=true`); what is unpickled
+            can run any program, so that the directory must be one to trust. Otherwise they start new episodes.
         callback, loggers: get the rows to come (see `train`).
 
     Raises UserError where there is no run, it has come to its end, or the checkpoint is damaged.
@@ -126,7 +129,7 @@ def resume(
     if env is not None:
         check(env)
     every = [*loggers, *([] if callback is None else [CallbackLogger(callback)])]
-    return _result(_recorder(every).resume(Path(run_dir), checkpoint, total_steps, env))
+    return _result(_recorder(every).resume(Path(run_dir), checkpoint, total_steps, env, unpickle))
 
 
 def _recorder(loggers: Sequence[Logger]) -> "Recorder":

@@ -89,12 +89,24 @@ class JointTeam(Environment):
         return state, self.join(state, observation)
 
     def step(self, key: chex.PRNGKey, state: Any, action: tuple[chex.Array, ...]) -> TimeStep:
-        inner = self.env.step(key, state, self.split(action))
+        return self._joined(self.env.step(key, state, self.split(action)))
+
+    def _joined(self, inner: TimeStep) -> TimeStep:
         rewards = tuple(inner.reward)
         mean = jnp.mean(jnp.stack([rewards[i] for i in self.members]))
         return inner._replace(
             observation=self.join(inner.state, inner.observation), reward=jnp.stack(self._replace(rewards, mean))
         )
+
+    @property
+    def on_host(self) -> bool:
+        return self.env.on_host
+
+    def step_or_reset(
+        self, key: chex.PRNGKey, reset_key: chex.PRNGKey, state: Any, action: tuple[chex.Array, ...]
+    ) -> tuple[TimeStep, Any, tuple[chex.Array, ...]]:
+        inner, going, observation = self.env.step_or_reset(key, reset_key, state, self.split(action))
+        return self._joined(inner), going, self.join(going, observation)
 
     def observe(self, state: Any) -> tuple[chex.Array, ...]:
         return self.join(state, self.env.observe(state))
