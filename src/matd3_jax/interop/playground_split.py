@@ -92,7 +92,7 @@ def _grouped(actuators: Sequence[str], group: Callable[[str], str | None], noun:
         found = group(name)
         if found is None:
             raise OptionError(
-                f"split='{noun}s': the name of actuator {name!r} says no {noun}; take NxM or lists of names"
+                f"split='{noun}s': the actuator {name!r} is named for no {noun}; take NxM or lists of names"
             )
         members.setdefault(found, []).append(i)
     return tuple(map(tuple, members.values()))

@@ -40,10 +40,15 @@ def parallel_env(
 
 
 def resolve(env: str | Environment, options: dict[str, Any]) -> Environment:
-    """The environment that `env` names or is, checked. Raises UserError for options of an instance."""
+    """The environment that `env` names or is, checked.
+
+    Raises UserError for options of an instance, and for an environment that another library steps in Python already.
+    """
     if isinstance(env, str):
         env = envs.make(env, **options)
     elif options:
         raise UserError(f"{', '.join(options)}: options go with an environment's name; this is an instance")
     envs.check(env)
+    if env.on_host:
+        raise UserError(f"{type(env).__name__} is another library's environment: hand that to who wants to step it")
     return env
