@@ -140,8 +140,11 @@ def from_jaxmarl(env: Any, **options_: Any) -> Environment:
     Raises OptionError for what does not have its methods or spaces, or has no time limit and is given none.
 
     Example:
-        >>> import jaxmarl  # doctest: +SKIP
-        >>> env = from_jaxmarl(jaxmarl.make("MPE_simple_tag_v3"))  # doctest: +SKIP
+        >>> from matd3_jax.interop.jaxmarl import JaxMARL
+        >>> theirs = JaxMARL(make("simple_push", actions="discrete"))  # as jaxmarl.make("MPE_simple_push_v3") is one
+        >>> env = from_jaxmarl(theirs, episode_length=25)
+        >>> env.teams, env.observation_sizes
+        (('adversaries', 'agents'), (8, 19))
     """
     from matd3_jax.interop.from_jaxmarl import FromJaxMARL
 

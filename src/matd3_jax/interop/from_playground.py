@@ -56,10 +56,6 @@ class PlaygroundTask(Environment):
 
     Raises OptionError for an unknown id, split or configuration, where Playground is not installed, and where the
     robot's model, which Playground downloads when one is first used, cannot be had.
-
-    Example:
-        >>> PlaygroundTask(id="CheetahRun", split="2x3").agents  # doctest: +SKIP
-        ('agent_0', 'agent_1')
     """
 
     id: str | None = None
