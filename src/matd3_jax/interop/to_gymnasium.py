@@ -167,7 +167,7 @@ def vector_env(
         >>> copies = vector_env("simple_spread", num_envs=3, joint=True, actions="continuous")
         >>> observations, infos = copies.reset(seed=0)
         >>> observations.shape, copies.single_action_space.shape
-        ((3, 54), (15,))
+        ((3, 54), (6,))
     """
     found = resolve(env, options)
     if joint:
