@@ -57,6 +57,65 @@ def single(name: str, steps: int) -> Block:
     return block
 
 
+COMPILED = 32
+"""Environments side by side in the own loops of libraries in JAX: as many as ours has with two devices."""
+
+
+def jaxmarl(name: str, steps: int, **kwargs: Any) -> Block:
+    """JaxMARL's: `step`, which resets by itself, vmapped over environments and scanned over env steps."""
+    import jax
+
+    from matd3_jax.interop.import_jaxmarl import import_jaxmarl
+
+    env = import_jaxmarl("this benchmark").make(name, **kwargs)
+
+    def step(key: Any, state: Any) -> Any:
+        keys = jax.random.split(key, len(env.agents) + 1)
+        actions = {a: env.action_space(a).sample(k) for a, k in zip(env.agents, keys[1:], strict=True)}
+        observations, state, rewards, *_ = env.step(keys[0], state, actions)
+        return state, (observations, rewards)
+
+    return _scanned(lambda keys: jax.vmap(env.reset)(keys)[1], jax.vmap(step), steps)
+
+
+def playground(name: str, steps: int) -> Block:
+    """Playground's: as its trainers wrap a task, which then resets by itself, scanned over env steps."""
+    import jax
+    from mujoco_playground import registry, wrapper
+
+    task = registry.load(name, config_overrides={"impl": "jax"})
+    env = wrapper.wrap_for_brax_training(task, episode_length=registry.get_default_config(name).episode_length)
+
+    def step(keys: Any, state: Any) -> Any:
+        action = jax.random.uniform(keys[0], (COMPILED, task.action_size), minval=-1.0)
+        state = env.step(state, action)
+        return state, (state.obs, state.reward)
+
+    return _scanned(env.reset, step, steps)
+
+
+def _scanned(reset: Callable[[Any], Any], step: Callable[[Any, Any], Any], steps: int) -> Block:
+    """`COMPILED` environments; all that is seen goes into the result, so that nothing can be left out."""
+    import jax
+
+    def one(carry: Any, _: None) -> Any:
+        key, state = carry
+        key, now = jax.random.split(key)
+        state, seen = step(jax.random.split(now, COMPILED), state)
+        return (key, state), sum(leaf.sum() for leaf in jax.tree.leaves(seen))
+
+    play = jax.jit(lambda carry: jax.lax.scan(one, carry, length=steps))
+    key = jax.random.PRNGKey(0)
+    kept = [(key, jax.jit(reset)(jax.random.split(key, COMPILED)))]
+
+    def block() -> int:
+        carry, _ = jax.block_until_ready(play(kept.pop()))
+        kept.append(carry)
+        return COMPILED * steps
+
+    return block
+
+
 def settings(env: str, name: str, *others: str, **kwargs: str | int) -> tuple[str, ...]:
     """Settings of a run with the environment `name`, made with `kwargs`."""
     given = [f"env.kwargs.{key}={value}" for key, value in kwargs.items()]
@@ -95,5 +154,17 @@ CASES = (
         settings("gymnasium", "CartPole-v1", "recipe=paper"),
         partial(single, "CartPole-v1"),
         ("gymnasium",),
+    ),
+    Case(
+        "JaxMARL simple_spread_v3",
+        settings("jaxmarl", "MPE_simple_spread_v3"),
+        partial(jaxmarl, "MPE_simple_spread_v3"),
+        ("jaxmarl",),
+    ),
+    Case(
+        "Playground CheetahRun, 2x3",
+        settings("playground", "CheetahRun", "env.split=2x3"),
+        partial(playground, "CheetahRun"),
+        ("playground", "mujoco-mjx"),
     ),
 )

@@ -72,3 +72,39 @@ def test_vmap_over_environments_that_end_apart():
     np.testing.assert_array_equal(after.step, [1, 0, 2])
     moved = np.abs(after.landmark - state.landmark).max(axis=(1, 2)) > 0
     np.testing.assert_array_equal(moved, [False, True, False])
+
+
+def test_all_choices_are_available():
+    env = JaxMARL(make("simple_crypto", actions="discrete"))
+    _, state = env.reset(jax.random.key(0))
+    np.testing.assert_array_equal(env.get_avail_actions(state)["bob_0"], np.ones(4))
+    assert JaxMARL(make("point_reach")).get_avail_actions(None) == {}
+
+
+def test_jaxmarls_log_wrapper_counts_episodes():
+    wrappers = pytest.importorskip("jaxmarl.wrappers.baselines", reason="the extra 'jaxmarl' is not installed")
+    inner = JaxMARL(make("simple_spread", actions="discrete", episode_length=2))
+    env = wrappers.LogWrapper(inner, replace_info=True)
+    _, state = env.reset(jax.random.key(0))
+    actions = {agent: jnp.int32(1) for agent in env.agents}
+    total = np.zeros(3)
+    for t in range(2):
+        _, state, rewards, dones, infos = env.step(jax.random.key(t), state, actions)
+        total += [float(rewards[agent]) for agent in env.agents]
+    assert dones["__all__"] and {leaf.shape for leaf in jax.tree.leaves(infos)} == {(3,)}  # as baselines reshape them
+    np.testing.assert_allclose(infos["returned_episode_returns"], total, rtol=1e-5)
+    np.testing.assert_array_equal(infos["returned_episode_lengths"], [2, 2, 2])
+
+
+def test_jaxmarls_rollout_manager_takes_its_own_spaces():
+    """That of its Q-learning, with agents of different sizes."""
+    wrappers = pytest.importorskip("jaxmarl.wrappers.baselines", reason="the extra 'jaxmarl' is not installed")
+    inner = make("simple_tag", actions="discrete", episode_length=2)
+    manager = wrappers.CTRolloutManager(JaxMARL(inner, own_spaces=True), batch_size=2)
+    observations, state = manager.batch_reset(jax.random.key(0))
+    assert observations["agent_0"].shape == (2, 16 + 4) and observations["__all__"].shape == (2, 3 * 16 + 14)
+    actions = {agent: manager.batch_sample(jax.random.key(0), agent) for agent in manager.agents}
+    observations, state, rewards, dones, _ = manager.batch_step(jax.random.key(1), state, actions)
+    assert not dones["__all__"].any() and rewards["__all__"].shape == (2,)
+    soft = JaxMARL(make("simple_tag"), own_spaces=True).action_space("agent_0")
+    assert (soft.low, soft.high, soft.shape) == (0.0, 1.0, (5,))

@@ -23,6 +23,7 @@ __all__ = [
     "TimeStep",
     "check",
     "from_gymnasium",
+    "from_jaxmarl",
     "from_pettingzoo",
     "make",
     "names",
@@ -54,6 +55,8 @@ _CLASSES = {
     "brax_swimmer": (".robots.brax", "BraxSwimmer"),
     "pettingzoo": (".host.parallel", "PettingZoo"),
     "gymnasium": (".host.single", "Gymnasium"),
+    "jaxmarl": ("..interop.from_jaxmarl", "JaxMARLTask"),
+    "playground": ("..interop.from_playground", "PlaygroundTask"),
 }
 
 
@@ -127,6 +130,25 @@ def from_gymnasium(source: Any, **options_: Any) -> Environment:
     from matd3_jax.envs.host.single import GymnasiumObject
 
     return _with_options(GymnasiumObject, source, options_)
+
+
+def from_jaxmarl(env: Any, **options_: Any) -> Environment:
+    """Take an environment of JaxMARL, an instance of its `MultiAgentEnv`.
+
+    `options_`: `episode_length` (see `interop.from_jaxmarl.FromJaxMARL`).
+
+    Raises OptionError for what does not have its methods or spaces, or has no time limit and is given none.
+
+    Example:
+        >>> from matd3_jax.interop.jaxmarl import JaxMARL
+        >>> theirs = JaxMARL(make("simple_push", actions="discrete"))  # as jaxmarl.make("MPE_simple_push_v3") is one
+        >>> env = from_jaxmarl(theirs, episode_length=25)
+        >>> env.teams, env.observation_sizes
+        (('adversaries', 'agents'), (8, 19))
+    """
+    from matd3_jax.interop.from_jaxmarl import FromJaxMARL
+
+    return _with_options(FromJaxMARL, env, options_)
 
 
 def _with_options(class_: Any, source: Any, given: dict[str, Any]) -> Environment:

@@ -1,4 +1,4 @@
-"""JaxMARL's calling convention (`MultiAgentEnv` of FLAIROx/JaxMARL) for any environment here; needs no JaxMARL."""
+"""JaxMARL's calling convention (`MultiAgentEnv` of bold-lab-ai/JaxMARL) for any environment here; needs no JaxMARL."""
 
 import dataclasses
 from functools import partial
@@ -6,9 +6,11 @@ from typing import Any
 
 import chex
 import jax
+import jax.numpy as jnp
 
 from matd3_jax.envs.environment import Environment
-from matd3_jax.envs.spaces import ActionSpace, Box
+from matd3_jax.envs.spaces import ActionSpace, Box, Discrete, MultiDiscrete, Simplex
+from matd3_jax.interop.import_jaxmarl import import_jaxmarl
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,9 +20,24 @@ class JaxMARL:
     `step` resets by itself when an episode ends, as JaxMARL's does: observation and state are then those of the new
     episode. `step_env` does not reset. `infos` of both hold what JaxMARL has no place for: "terminated" and
     "truncated" (boolean scalars) and "final_observation" (per agent, before any reset). All pure and jit-compiled.
+
+    `infos` are not one number for each agent: where an algorithm of JaxMARL reshapes them like that, wrap this in its
+    `LogWrapper(env, replace_info=True)`. Some of its code asks whether a space is one of its own classes
+    (`CTRolloutManager`, for its Q-learning): `own_spaces=True` gives those, and needs JaxMARL; soft choices (Simplex)
+    are a Box from 0 to 1 there.
+
+    Example:
+        >>> from matd3_jax import envs
+        >>> env = JaxMARL(envs.make("simple_spread", actions="discrete"))
+        >>> observations, state = env.reset(jax.random.key(0))
+        >>> actions = {agent: env.action_space(agent).sample(jax.random.key(1)) for agent in env.agents}
+        >>> observations, state, rewards, dones, infos = env.step(jax.random.key(2), state, actions)
+        >>> observations["agent_0"].shape, bool(dones["__all__"])
+        ((18,), False)
     """
 
     env: Environment
+    own_spaces: bool = False
 
     @property
     def name(self) -> str:
@@ -42,13 +59,29 @@ class JaxMARL:
             classes.setdefault(team, []).append(agent)
         return classes
 
-    def observation_space(self, agent: str) -> Box:
-        """Unbounded box. Raises KeyError for an unknown agent."""
-        return Box(self._by_agent(self.env.observation_sizes)[agent])
+    @property
+    def observation_spaces(self) -> dict[str, Any]:
+        """Unbounded boxes."""
+        return {a: self._space(Box(size)) for a, size in self._by_agent(self.env.observation_sizes).items()}
 
-    def action_space(self, agent: str) -> ActionSpace:
+    @property
+    def action_spaces(self) -> dict[str, Any]:
+        """Spaces with `shape` and `sample(key)`, Discrete with `n`."""
+        return {agent: self._space(space) for agent, space in self._by_agent(self.env.action_spaces).items()}
+
+    def observation_space(self, agent: str) -> Any:
+        """Unbounded box. Raises KeyError for an unknown agent."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Any:
         """A space with `shape` and `sample(key)`. Raises KeyError for an unknown agent."""
-        return self._by_agent(self.env.action_spaces)[agent]
+        return self.action_spaces[agent]
+
+    def get_avail_actions(self, state: Any) -> dict[str, chex.Array]:
+        """For each agent with choices a one for each of them: all are available."""
+        del state
+        spaces = self._by_agent(self.env.action_spaces)
+        return {a: jnp.ones(space.size) for a, space in spaces.items() if isinstance(space, Discrete | MultiDiscrete)}
 
     @partial(jax.jit, static_argnums=0)
     def reset(self, key: chex.PRNGKey) -> tuple[dict[str, chex.Array], Any]:
@@ -88,6 +121,17 @@ class JaxMARL:
     def get_obs(self, state: Any) -> dict[str, chex.Array]:
         """Observations in `state`."""
         return self._by_agent(self.env.observe(state))
+
+    def _space(self, space: ActionSpace) -> Any:
+        if not self.own_spaces:
+            return space
+        spaces = import_jaxmarl("own_spaces=True").environments.spaces
+        if isinstance(space, Discrete):
+            return spaces.Discrete(space.n)
+        if isinstance(space, MultiDiscrete):
+            return spaces.MultiDiscrete(space.sizes)
+        low, high = (0.0, 1.0) if isinstance(space, Simplex) else (space.low, space.high)
+        return spaces.Box(low, high, space.shape)
 
     def _by_agent(self, items: tuple) -> dict[str, Any]:
         return dict(zip(self.env.agents, items, strict=True))
