@@ -156,7 +156,7 @@ def test_a_fresh_process_answers_or_says_what_went_wrong(tmp_path):
         ("bug", RuntimeError, "ZeroDivisionError"),
     ):
         with pytest.raises(error, match=text):
-                        fresh.run("asked", [word], environment)
+            fresh.run("asked", [word], environment)
 
 
 def test_recording_counts_the_replays_that_it_writes(tmp_path):

@@ -97,9 +97,9 @@ def load(overrides: Sequence[str] = (), known: Sequence[str] = ()) -> Config:
     resolved["env"] = _with_engine(resolved["env"])
     for key in ("robot", "per_algorithm"):  # what only serves the files
         resolved.pop(key, None)
-    for override in (o for o in parsed if _is_text(o)):
-        *group, name = override.key_or_group.split(".")
-        (resolved[group[0]] if group else resolved)[name] = _writable(override)
+    for text in (o for o in parsed if _is_text(o)):
+        *groups, last = text.key_or_group.split(".")
+        (resolved[groups[0]] if groups else resolved)[last] = _writable(text)
     return from_dict(_with_frozen_teams(resolved, parsed))  # type: ignore[arg-type]
 
 

@@ -31,7 +31,8 @@ def model(policy: Perceptron, name: str, facts: Mapping[str, Any]) -> Any:
     """
     from onnx import TensorProto, helper, numpy_helper
 
-    nodes, constants = [], []
+    nodes: list[Any] = []
+    constants: list[Any] = []
     space = policy.space
 
     def constant(name: str, value: Any, dtype: type = np.float32) -> str:

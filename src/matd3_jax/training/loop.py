@@ -150,9 +150,9 @@ class TrainLoop:
 
     @cached_property
     def _init(self) -> Callable:
-        settings = self.env, self.layout, self.schedule.num_envs, self.normalize_observations, self.q_bias_pairs
-        settings += (self.earlier_statistics,)
-        return self.sharding.sharded(partial(initial, *settings), P("seeds"), self._specs)
+        settings = self.env, self.layout, self.schedule.num_envs, self.normalize_observations
+        begin = partial(initial, *settings, self.q_bias_pairs, self.earlier_statistics)
+        return self.sharding.sharded(begin, P("seeds"), self._specs)
 
     @cached_property
     def _compiled_init(self) -> Callable:

@@ -203,6 +203,6 @@ def _summarized(run: RunDirectory, step: int, found: dict[str, Any]) -> Summariz
             own["diverged_at"] = found["diverged"][str(seed)]
         else:
             there = metrics["seed"] == seed
-            own["last_tenth"] = summary.finals({name: column[there] for name, column in metrics.items()})
+            own["last_tenth"] = summary.finals({name: column[there] for name, column in metrics.items()}, step)
         seeds[seed] = messages.numbers(own)
     return Summarized(0, step, messages.numbers(found), seeds)

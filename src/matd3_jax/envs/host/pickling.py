@@ -25,7 +25,7 @@ def loads(dumped: bytes) -> Any:
     return pickle.load(BytesIO(dumped))
 
 
-def _bare(cls: type) -> Any:
+def _bare(cls: Any) -> Any:
     return cls.__new__(cls)
 
 

@@ -1,5 +1,6 @@
 """What the entries of a robot's observations and actions are, in words with units, from its model."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +11,10 @@ from matd3_jax.envs.robots.partition.layout import Layout
 AXES = ("x", "y", "z")
 INERTIA = (*(f"inertia {pair} (kg m^2)" for pair in ("xx", "yy", "zz", "xy", "xz", "yz")),
            *(f"mass times offset {axis} (kg m)" for axis in AXES), "mass (kg)")  # fmt: skip
+
+
+def _of_body(model: mujoco.MjModel, parts: tuple[str, ...], body: int) -> tuple[str, ...]:
+    return tuple(f"body {model.body(body).name}: {part}" for part in parts)
 
 
 def full_observation(layout: Layout, model: mujoco.MjModel) -> tuple[str, ...]:
@@ -27,11 +32,9 @@ def full_observation(layout: Layout, model: mujoco.MjModel) -> tuple[str, ...]:
         "qpos": (model.nq, lambda i: (places[i],)),
         "qvel": (model.nv, lambda i: (degrees[i],)),
         "qfrc_actuator": (model.nv, lambda i: (forces[i],)),
-        **{
-            kind: (model.nbody, lambda body, parts=parts: tuple(f"body {model.body(body).name}: {p}" for p in parts))
-            for kind, parts in of_bodies.items()
-        },
     }
+    for kind, parts in of_bodies.items():
+        kinds[kind] = model.nbody, functools.partial(_of_body, model, parts)
     for kind, (count, words) in kinds.items():
         for index in range(count):
             for entry, text in zip(layout.entry(kind, index), words(index), strict=False):
