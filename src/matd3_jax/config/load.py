@@ -129,7 +129,7 @@ def _with_frozen_teams(resolved: Mapping[Any, Any], parsed: Sequence[Override]) 
         if not (path / "config.yaml").is_file():
             what = "it has no config.yaml" if path.is_dir() else "there is no such directory"
             raise UserError(f"{group}.policy={path} is no run directory: {what}")
-        source = read(path).teams()[team]
+        source = read(path / "config.yaml").teams()[team]
         found[group] = {**plain(dataclasses.asdict(source)), **{name: own[name] for name in OF_FROZEN}}
     return found
 
