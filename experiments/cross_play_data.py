@@ -137,7 +137,8 @@ def of_command(folder: Path, side: int) -> Task:
         raise UserError(f"cannot read {folder} as a cross-play of the four pairings: {error!r}") from error
     named = {"-vs-".join(PAIRINGS[pairing[name]]): run for name, run in kept["runs"].items()}
     facts = {"episodes": kept["episodes"], "deterministic": kept["deterministic"]}
-    ours = {name: {key: run[key] for key in ("checkpoint", "seeds")} for name, run in named.items()}
+    order = ("-vs-".join(pair) for pair in PAIRINGS)
+    ours = {name: {key: named[name][key] for key in ("checkpoint", "seeds")} for name in order}
     return Task({**facts, "runs": ours}, np.array(runs), np.array(seeds), np.array(returns))
 
 

@@ -24,7 +24,7 @@ def results(folder, scale, level, labels):
     lines = target_smoothing.settings(scale, StudyOptions())
     name = "target_smoothing" + "_small" * (scale == "small")
     for label in labels:
-        returns = {"return_agents": (NOISE, (level if label != "none" else 10) + 0.1 * NOISE)}
+        returns = {"return_agents": (NOISE, (10 if label == labels[0] else level) + 0.1 * NOISE)}
         fake_run(folder / "runs" / name / label, [t for t in lines[label] if "seeds" not in t], returns)
     places = [f"runs={folder / 'runs' / name}", f"out={folder / 'results' / name}"]
     assert target_smoothing.main([f"scale={scale}", "train=false", *places]) == 0
