@@ -5,7 +5,7 @@ import functools
 import tempfile
 from pathlib import Path
 
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from properties import examples, texts
 
@@ -55,7 +55,11 @@ def test_any_text_for_any_setting(key, text):
 
 
 @given(st.sampled_from(["name", "out"]), texts)
-@examples(12)
+@example("name", "1e3")
+@example("name", "null")
+@example("out", "lr=0.01,[a]")
+@example("out", "'x' \u00e9")
+@examples(10)
 def test_a_text_is_taken_as_it_is_typed(key, text):
     if not refused(lambda: config.load([f"{key}={text}"])):
         assert getattr(config.load([f"{key}={text}"]), key) == text
