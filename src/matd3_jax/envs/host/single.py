@@ -202,7 +202,7 @@ class Gymnasium(_Single):
 
         def make() -> Any:
             limit = {} if self.episode_length is None else {"max_episode_steps": self.episode_length}
-            return gymnasium.make(self.id, disable_env_checker=True, **{**limit, **self.kwargs})
+            return gymnasium.make(str(self.id), disable_env_checker=True, **{**limit, **self.kwargs})
 
         try:
             with sources.without_greetings(), quiet():
