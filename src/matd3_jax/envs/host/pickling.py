@@ -25,8 +25,8 @@ def loads(dumped: bytes) -> Any:
     return pickle.load(BytesIO(dumped))
 
 
-def _bare(cls: Any) -> Any:
-    return cls.__new__(cls)
+def _bare(cls: type) -> Any:
+    return object.__new__(cls)
 
 
 def _set_attributes(obj: Any, attributes: dict[str, Any]) -> None:

@@ -200,11 +200,9 @@ class Gymnasium(_Single):
         if not isinstance(self.id, str) or not self.id:
             raise OptionError(f"env.id={self.id!r}: must name an environment of gymnasium, for instance env.id=Ant-v5")
 
-        name = self.id
-
         def make() -> Any:
             limit = {} if self.episode_length is None else {"max_episode_steps": self.episode_length}
-            return gymnasium.make(name, disable_env_checker=True, **{**limit, **self.kwargs})
+            return gymnasium.make(str(self.id), disable_env_checker=True, **{**limit, **self.kwargs})
 
         try:
             with sources.without_greetings(), quiet():
