@@ -39,6 +39,11 @@ pre { margin: 0.5rem 0; padding: 0.6rem; background: var(--card); border: 1px so
   font-size: 0.85rem; white-space: pre-wrap; overflow-wrap: anywhere; }
 nav a { margin-right: 1rem; }
 a { color: inherit; }
+@media (max-width: 40rem) {
+  th, td { padding: 0.3rem 0.4rem; }
+  thead th { white-space: normal; }
+  tbody th { min-width: 5rem; }
+}
 @media print {
   :root { --ink: #000; --faint: #444; --paper: #fff; --card: #fff; --line: #bbb; color-scheme: light; }
   body { max-width: none; font-size: 10pt; padding: 0; }
