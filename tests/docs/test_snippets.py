@@ -117,6 +117,7 @@ def test_python_parses(name):
         assert block.language in ("python", "sh", "diff", "yaml", "text"), f"{name}:{block.line}: {block.language!r}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["README.md", "docs/environments.md", "docs/running.md", "docs/sweeps.md"])
 def test_python_runs(name, tmp_path, monkeypatch):
     """Blocks of a document share their names. Trainings are shorter than they are written."""
