@@ -77,6 +77,7 @@ def plain(tmp_path_factory):
     return train(package(tmp_path_factory.mktemp("plain"), []))[0]
 
 
+@pytest.mark.slow
 def test_environment_and_logger_train_as_written(tmp_path, monkeypatch, capsys):
     """In the order of the document: the blocks share their names, as they do for who pastes them."""
     monkeypatch.chdir(tmp_path)
@@ -92,6 +93,7 @@ def test_environment_and_logger_train_as_written(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out.startswith("[[")
 
 
+@pytest.mark.slow
 def test_loss_and_its_setting(tmp_path, plain):
     constant = train(package(tmp_path / "constant", ["A loss"]))[0]
     assert not same(constant, plain)
@@ -102,6 +104,7 @@ def test_loss_and_its_setting(tmp_path, plain):
         np.testing.assert_allclose(on[name], constant[name], rtol=1e-3, err_msg=name)
 
 
+@pytest.mark.slow
 def test_critic_head(tmp_path, plain):
     """Before the first update nothing differs; then losses do, as errors beyond 1 count linearly."""
     usual, huber = train(package(tmp_path, ["A critic head"]), "algo=matd3", "algo=matd3_huber")
@@ -110,6 +113,7 @@ def test_critic_head(tmp_path, plain):
     assert (huber["agent_0_critic_loss"][:, -1] < plain["agent_0_critic_loss"][:, -1]).all()
 
 
+@pytest.mark.slow
 def test_network(tmp_path, plain):
     residual = train(package(tmp_path, ["A network"]))[0]
     assert not same(residual, plain)

@@ -126,6 +126,7 @@ def missing(code):
     return any(name in OPTIONAL and importlib.util.find_spec(name) is None for name in names)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["README.md", "docs/environments.md", "docs/interop.md", "docs/running.md", "docs/sweeps.md"]
 )

@@ -8,7 +8,7 @@ from typing import Any
 
 from matd3_jax.bounds import Bounds
 
-LONG = "x" * 100_000
+LONG = "x" * 10_000
 DIGITS = "9" * 5_000
 """More than Python turns into a number."""
 

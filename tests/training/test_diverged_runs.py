@@ -46,6 +46,7 @@ def table(path):
         return [row for row in csv.DictReader(file) if int(row["seed"]) != LOST]
 
 
+@pytest.mark.slow
 def test_a_seed_that_diverges_is_reported_and_left_out(blown, tmp_path, monkeypatch, capsys):
     said, path = [], tmp_path / "run"
     recorded = Recorder(say=said.append).start(config.load(SMALL), path)
@@ -131,6 +132,7 @@ def test_from_python_it_is_a_warning(blown):
     assert result.diverged[LOST] == step[~np.isfinite(losses[1]) & (result.metrics["updates"][1] > 0)][0]
 
 
+@pytest.mark.slow
 def test_networks_that_no_loss_shows(tmp_path):
     """A weight of -inf before a ReLU leaves outputs finite."""
     settings = config.load(SMALL)

@@ -169,6 +169,7 @@ def test_nested_reports_count_once(monkeypatch):
     assert clock.compiling() == 6 + 3
 
 
+@pytest.mark.slow
 def test_a_run_counts_its_evaluations(now, monkeypatch):
     """As many as have numbers in the table and as were expected; what an evaluation takes is no training."""
     monkeypatch.setattr(clock, "compiling", lambda: 0.0)

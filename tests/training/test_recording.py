@@ -286,6 +286,7 @@ class Empty(Environment):
         return INNER.observe(state[0])
 
 
+@pytest.mark.slow
 def test_from_python_with_an_environment_of_ones_own_whose_state_has_an_empty_array(tmp_path):
     """The directory is the command's; resumed it gives the unbroken run's numbers."""
     small = dict(text.split("=") for text in SMALL if not text.startswith(("env=", "algo", "total_steps")))
