@@ -64,7 +64,8 @@ class WandbBackend:
 
     def attach(self, key: tuple[int, int | None], step: int, path: Path) -> None:
         if path.suffix in (".gif", ".mp4"):
-            self.runs[key].log({"video": self.wandb.Video(str(path), format=path.suffix[1:])}, step=step)
+            kind: Any = path.suffix[1:]
+            self.runs[key].log({"video": self.wandb.Video(str(path), format=kind)}, step=step)
         elif path.suffix == ".png":
             self.runs[key].log({path.stem: self.wandb.Image(str(path))}, step=step)
 
