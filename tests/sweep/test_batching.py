@@ -42,6 +42,7 @@ def test_shapes_and_schedules_do_not(override):
     assert batching.program(load(override)) != batching.program(load())
 
 
+@pytest.mark.slow
 def test_settings_that_share_a_program_compile_to_the_same_text():
     """What `program` says is what XLA sees: the lowered interval does not depend on the members' numbers."""
 

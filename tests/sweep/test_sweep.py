@@ -242,6 +242,7 @@ def test_more_seeds_train_only_what_is_missing(swept, tmp_path, monkeypatch):
     assert len(trained) == 1
 
 
+@pytest.mark.slow
 def test_a_launcher_trains_nothing_that_is_finished(swept, capfd):
     """Hydra starts the jobs, in folders of the sweep's own."""
     assert launcher.launch(swept, 1, "basic", []) == 0
