@@ -158,6 +158,7 @@ def test_where_there_is_no_run(run, tmp_path):
             check.main(argv)
 
 
+@pytest.mark.slow
 def test_a_sweep(tmp_path, capsys):
     settings = [*SMALL, "total_steps=400", "algo.lr=0.01,0.001", f"out={tmp_path}", "name=sweep"]
     assert sweep.main([*settings, "train=false"]) == 0

@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pytest
 from checkpoint_arrays import leaves
 
 from matd3_jax import config
@@ -20,6 +21,7 @@ TINY = [
 DISTRIBUTION = ["algo.critic_range=[-60,5]", "algo.critic_atoms=9", "adversary.critic_norm=layer"]
 
 
+@pytest.mark.slow
 def test_resumed_to_the_bit(tmp_path):
     """A categorical team against one with layer normalization, Q-bias measured on the way."""
     line = [*TINY, *DISTRIBUTION, "algo.critic_head=categorical", "diagnostics.q_bias=true", f"out={tmp_path}"]
