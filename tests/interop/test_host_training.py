@@ -104,9 +104,11 @@ def test_a_team_as_one_agent():
     (state, (x,)), key = env.reset(jax.random.key(0)), jax.random.key(1)
     for t in (1, 2, 3):
         after, state, (seen,) = env.step_or_reset(key, key, state, (jnp.array([0.5, -0.5]),))
-        np.testing.assert_allclose(after.reward, [-np.abs(np.array([3, 1]) - 2 * x[[0, 2]]).mean()], rtol=1e-5)
+        np.testing.assert_allclose(
+            after.reward, [-np.abs(np.array([3, 1]) - 2 * np.asarray(x)[[0, 2]]).mean()], rtol=1e-5
+        )
         assert bool(after.truncated) == (t == 2) and after.observation[0].shape == (4,)
-        assert seen[1] == pytest.approx(t % 2 / 10)
+        assert float(seen[1]) == pytest.approx(t % 2 / 10)
         x = seen
 
 
