@@ -278,8 +278,10 @@ BAD = {
         "init=SOURCE: the actor of agent_0 does not fit: bias_0 is [7] there, [64] here",
     "init=SOURCE algo.num_critics=1 " + " ".join(SAME):
         "init=SOURCE: the critic of agent_0 does not fit: bias_0 is [2, 7] there, [1, 7] here",
-    "init=SOURCE env=simple_tag " + " ".join(SAME): "init=SOURCE: there is no adversary_1 there, but adversary_0, ",
-    "init=SOURCE env.num_good=3 " + " ".join(SAME): "reads 8 numbers there, 10 here",
+    "init=SOURCE env=simple_speaker_listener " + " ".join(N):
+        "init=SOURCE: there is no speaker_0 there, but adversary_0, agent_0, agent_1",
+    "init=SOURCE env.num_good=3 " + " ".join(SAME):
+        "init=SOURCE: the actor of adversary_0 does not fit: its layer 0 reads 8 numbers there, ",
     "init=SOURCE env.actions=discrete " + " ".join(SAME): "acts in Simplex(sizes=(5,)) there, in Discrete(n=5) here",
     "init_seed=3": "init_checkpoint= and init_seed= go with init=RUN_DIR",
     "init=SOURCE init_checkpoint=newest": "init_checkpoint=newest: must be the env step of a checkpoint",
@@ -291,7 +293,7 @@ BAD = {
     "adversary.frozen=true adversary.policy=nowhere": "adversary.policy=nowhere is no run directory: there is no such",
     "adversary.frozen=true adversary.policy=SOURCE adversary.lr=0.1": "adversary.lr=0.1: a frozen team has the",
     "adversary.frozen=true adversary.policy=SOURCE adversary=matd3": "adversary=matd3: a frozen team has the settings",
-    "adversary.frozen=true adversary.policy=SOURCE env=simple_push": "reads 8 numbers there",
+    "adversary.frozen=true adversary.policy=SOURCE env=simple_tag": "reads 8 numbers there, 16",
     "adversary.frozen=true adversary.policy=SOURCE adversary.policy_seed=9": "adversary.policy_seed=9: the seeds of",
     "adversary.frozen=true adversary.policy=SOURCE adversary.policy_checkpoint=x": "policy_checkpoint=x: must be",
     "adversary.frozen=true adversary.policy=SOURCE env=simple_spread": "has no adversaries",
