@@ -1,6 +1,5 @@
 """What the entries of a robot's observations and actions are, in words with units, from its model."""
 
-from collections.abc import Callable
 from typing import Any
 
 import mujoco
@@ -23,18 +22,17 @@ def full_observation(layout: Layout, model: mujoco.MjModel) -> tuple[str, ...]:
     degrees = [text for joint in range(model.njnt) for text in _velocities(model, joint)]
     forces = [_replaced(text) for text in degrees]
     places = [text for joint in range(model.njnt) for text in _positions(model, joint)]
-    kinds: dict[str, tuple[int, Callable[[int], tuple[str, ...]]]] = {
-        "qpos": (model.nq, lambda i: (places[i],)),
-        "qvel": (model.nv, lambda i: (degrees[i],)),
-        "qfrc_actuator": (model.nv, lambda i: (forces[i],)),
-        **{
-            kind: (model.nbody, lambda body, parts=parts: tuple(f"body {model.body(body).name}: {p}" for p in parts))
-            for kind, parts in of_bodies.items()
-        },
+    words: dict[str, list[tuple[str, ...]]] = {
+        "qpos": [(text,) for text in places],
+        "qvel": [(text,) for text in degrees],
+        "qfrc_actuator": [(text,) for text in forces],
     }
-    for kind, (count, words) in kinds.items():
-        for index in range(count):
-            for entry, text in zip(layout.entry(kind, index), words(index), strict=False):
+    for kind, parts in of_bodies.items():
+        bodies = [model.body(body).name for body in range(model.nbody)]
+        words[kind] = [tuple(f"body {body}: {part}" for part in parts) for body in bodies]
+    for kind, each in words.items():
+        for index, texts in enumerate(each):
+            for entry, text in zip(layout.entry(kind, index), texts, strict=False):
                 names[entry] = text
     return tuple(names)
 
