@@ -28,7 +28,7 @@ def full_observation(layout: Layout, model: mujoco.MjModel) -> tuple[str, ...]:
         "qfrc_actuator": [(text,) for text in forces],
     }
     for kind, parts in of_bodies.items():
-        bodies = [model.body(body).name for body in range(model.nbody)]
+        bodies = [model.body(body).name or str(body) for body in range(model.nbody)]
         words[kind] = [tuple(f"body {body}: {part}" for part in parts) for body in bodies]
     for kind, each in words.items():
         for index, texts in enumerate(each):
