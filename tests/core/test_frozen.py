@@ -36,6 +36,7 @@ def trained(trainer, change=lambda state: state):
     return before, state, metrics
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [{}, {"shared_minibatch": True}, {"sequential": True}], ids=str)
 def test_its_networks_stay_the_same_to_the_bit(how):
     """While the others learn from their minibatches, in any order."""

@@ -60,6 +60,7 @@ def test_an_episode_has_the_return_of_our_own_evaluation(example, lines, tmp_pat
     assert found == pytest.approx(returns[100], rel=1e-4) and max(after) < 1e-5
 
 
+@pytest.mark.slow
 def test_the_program_prints_a_mean(example, tmp_path, quick_jit, capsys):
     training = TrainingSession(config.load(["env=ant", "seeds=1", "algo.hidden=[4]", "env.episode_length=20"]))
     saved = SavedPolicies(training.trainer.init(training.keys()), np.array([0]), np.array([True]), {})

@@ -157,6 +157,7 @@ def test_runs_without_them_say_so(copy):
     assert check.main([f"run={copy}"]) == 0
 
 
+@pytest.mark.slow
 def test_runs_of_a_sweep_have_their_own(tmp_path):
     """As if each had been trained alone."""
     argv = [*SMALL, "total_steps=800", "algo.lr=0.05,0.01", "seeds=2", f"out={tmp_path}", "name=two"]

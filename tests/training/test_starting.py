@@ -122,6 +122,7 @@ def test_it_plays_as_in_its_own_run(fighting, source):
     np.testing.assert_allclose(found, last, rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("left", ["nothing but its settings", "its second checkpoint"])
 def test_a_killed_run_comes_to_the_same_bits_without_its_source(copy, fighting, left):
     (copy / "summary.json").unlink()
@@ -139,6 +140,7 @@ def test_a_killed_run_comes_to_the_same_bits_without_its_source(copy, fighting, 
         np.testing.assert_array_equal(found[name], value, err_msg=name)
 
 
+@pytest.mark.slow
 def test_commands_play_it(fighting, tmp_path, capsys):
     assert evaluate.main([f"run={fighting}", "episodes=2", "checkpoint=best"]) == 0
     assert crossplay.main([f"runs={fighting}", "episodes=2", f"out={tmp_path / 'out'}", "checkpoint=best"]) == 0
@@ -171,6 +173,7 @@ def test_agents_may_be_the_frozen_ones(source):
             np.testing.assert_array_equal(given[path][seed], kept.policies[path])
 
 
+@pytest.mark.slow
 def test_critics_judged_beside_a_frozen_team(source):
     """Overestimation is that of the learners alone."""
     lines = ["diagnostics.q_bias=true", "diagnostics.q_bias_rollouts=4", "diagnostics.q_bias_steps=3", "seeds=1"]
@@ -180,6 +183,7 @@ def test_critics_judged_beside_a_frozen_team(source):
     assert set(row) == set(training.columns)
 
 
+@pytest.mark.slow
 def test_runs_of_a_sweep_play_against_it(source, tmp_path, capsys):
     argv = [*AGAINST, f"adversary.policy={source}", "algo.lr=0.01,0.001", f"out={tmp_path}", "name=two", "seeds=1"]
     assert sweep.main([text for text in argv if text != "seeds=3"]) == 0
@@ -247,6 +251,7 @@ def test_of_the_best_evaluations_come_the_actors(source):
                 np.testing.assert_array_equal(given[path.format(part)][1], kept.policies[path.format("actor")])
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_from_where_the_other_was(source, tmp_path):
     """Its first row is what the source's policies get; killed before its first checkpoint it begins with them again."""
     settings = beginning(source).config
@@ -278,8 +283,10 @@ BAD = {
         "init=SOURCE: the actor of agent_0 does not fit: bias_0 is [7] there, [64] here",
     "init=SOURCE algo.num_critics=1 " + " ".join(SAME):
         "init=SOURCE: the critic of agent_0 does not fit: bias_0 is [2, 7] there, [1, 7] here",
-    "init=SOURCE env=simple_tag " + " ".join(SAME): "init=SOURCE: there is no adversary_1 there, but adversary_0, ",
-    "init=SOURCE env.num_good=3 " + " ".join(SAME): "reads 8 numbers there, 10 here",
+    "init=SOURCE env=simple_speaker_listener " + " ".join(N):
+        "init=SOURCE: there is no speaker_0 there, but adversary_0, agent_0, agent_1",
+    "init=SOURCE env.num_good=3 " + " ".join(SAME):
+        "init=SOURCE: the actor of adversary_0 does not fit: its layer 0 reads 8 numbers there, ",
     "init=SOURCE env.actions=discrete " + " ".join(SAME): "acts in Simplex(sizes=(5,)) there, in Discrete(n=5) here",
     "init_seed=3": "init_checkpoint= and init_seed= go with init=RUN_DIR",
     "init=SOURCE init_checkpoint=newest": "init_checkpoint=newest: must be the env step of a checkpoint",
@@ -291,7 +298,7 @@ BAD = {
     "adversary.frozen=true adversary.policy=nowhere": "adversary.policy=nowhere is no run directory: there is no such",
     "adversary.frozen=true adversary.policy=SOURCE adversary.lr=0.1": "adversary.lr=0.1: a frozen team has the",
     "adversary.frozen=true adversary.policy=SOURCE adversary=matd3": "adversary=matd3: a frozen team has the settings",
-    "adversary.frozen=true adversary.policy=SOURCE env=simple_push": "reads 8 numbers there",
+    "adversary.frozen=true adversary.policy=SOURCE env=simple_tag": "reads 8 numbers there, 16",
     "adversary.frozen=true adversary.policy=SOURCE adversary.policy_seed=9": "adversary.policy_seed=9: the seeds of",
     "adversary.frozen=true adversary.policy=SOURCE adversary.policy_checkpoint=x": "policy_checkpoint=x: must be",
     "adversary.frozen=true adversary.policy=SOURCE env=simple_spread": "has no adversaries",

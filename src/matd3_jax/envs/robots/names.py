@@ -1,7 +1,5 @@
 """What the entries of a robot's observations and actions are, in words with units, from its model."""
 
-import functools
-from collections.abc import Callable
 from typing import Any
 
 import mujoco
@@ -11,10 +9,6 @@ from matd3_jax.envs.robots.partition.layout import Layout
 AXES = ("x", "y", "z")
 INERTIA = (*(f"inertia {pair} (kg m^2)" for pair in ("xx", "yy", "zz", "xy", "xz", "yz")),
            *(f"mass times offset {axis} (kg m)" for axis in AXES), "mass (kg)")  # fmt: skip
-
-
-def _of_body(model: mujoco.MjModel, parts: tuple[str, ...], body: int) -> tuple[str, ...]:
-    return tuple(f"body {model.body(body).name}: {part}" for part in parts)
 
 
 def full_observation(layout: Layout, model: mujoco.MjModel) -> tuple[str, ...]:
@@ -28,16 +22,17 @@ def full_observation(layout: Layout, model: mujoco.MjModel) -> tuple[str, ...]:
     degrees = [text for joint in range(model.njnt) for text in _velocities(model, joint)]
     forces = [_replaced(text) for text in degrees]
     places = [text for joint in range(model.njnt) for text in _positions(model, joint)]
-    kinds: dict[str, tuple[int, Callable[[int], tuple[str, ...]]]] = {
-        "qpos": (model.nq, lambda i: (places[i],)),
-        "qvel": (model.nv, lambda i: (degrees[i],)),
-        "qfrc_actuator": (model.nv, lambda i: (forces[i],)),
+    words: dict[str, list[tuple[str, ...]]] = {
+        "qpos": [(text,) for text in places],
+        "qvel": [(text,) for text in degrees],
+        "qfrc_actuator": [(text,) for text in forces],
     }
     for kind, parts in of_bodies.items():
-        kinds[kind] = model.nbody, functools.partial(_of_body, model, parts)
-    for kind, (count, words) in kinds.items():
-        for index in range(count):
-            for entry, text in zip(layout.entry(kind, index), words(index), strict=False):
+        bodies = [model.body(body).name or str(body) for body in range(model.nbody)]
+        words[kind] = [tuple(f"body {body}: {part}" for part in parts) for body in bodies]
+    for kind, each in words.items():
+        for index, texts in enumerate(each):
+            for entry, text in zip(layout.entry(kind, index), texts, strict=False):
                 names[entry] = text
     return tuple(names)
 
