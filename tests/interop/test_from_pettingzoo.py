@@ -255,7 +255,13 @@ class Uncopied(Guess):
         raise TypeError("no copies")
 
 
+class Unseeded(Guess):
+    def reset(self):
+        return super().reset()
+
+
 REFUSED = {
+    "no seeds": (Unseeded, "Unseeded cannot be played: TypeError: "),
     "no time limit": (Endless, "give env.episode_length="),
     "masks": (Masked, "action_mask, which is not supported"),
     "masks in infos": (MaskedInfos, "action_mask, which is not supported"),

@@ -22,7 +22,7 @@ from matd3_jax.training.session import TrainingSession
 
 SMALL = {
     **{"total_steps": 240, "learning_starts": 80, "num_envs": 2, "rollout_length": 7, "batch_size": 16},
-    **{"replay_capacity": 280, "log_every": 56, "eval_every": 56, "eval_episodes": 2, "checkpoint_minutes": 0},
+    **{"replay_capacity": 560, "log_every": 56, "eval_every": 56, "eval_episodes": 2, "checkpoint_minutes": 0},
 }
 LINES = [f"{key}={value}" for key, value in SMALL.items()] + ["algo.hidden=[8]"]
 
@@ -39,7 +39,9 @@ def three():
 
 
 def rows_of(result, seed):
-    parts = result.training.layout.row_parts(np.asarray(result.state.replay)[seed, :238])
+    filled = result.training.trainer.schedule.filled_rows(int(result.state.rollouts))
+    assert filled == result.training.total_steps  # nothing was overwritten
+    parts = result.training.layout.row_parts(np.asarray(result.state.replay)[seed, :filled])
     return parts.x, parts.action, parts.reward, parts.next_x, parts.discount
 
 
@@ -172,9 +174,9 @@ def test_pickles_are_loaded_only_when_that_is_said_again(pickled, loaded):
     ):
         resumed = matd3_jax.resume(run, total_steps=240)
     assert loaded == [1] and final(run) != final(pickled / "whole")
-    x = resumed.training.layout.row_parts(np.asarray(resumed.state.replay)[0]).x
-    t = np.round(10 * x[:238, 1]).astype(int).reshape(-1, 7, 2)
-    fresh = [place for place in range(1, len(t)) if t[place, 0, 0] not in ((t[place - 1, -1, 0] + 1) % 10,)]
+    x, *_ = rows_of(resumed, 0)
+    t = np.round(10 * x[:, 1]).astype(int).reshape(-1, 7, 2)
+    fresh = [rollout for rollout in range(1, len(t)) if t[rollout, 0, 0] != (t[rollout - 1, -1, 0] + 1) % 10]
     assert len(fresh) == 1 and t[fresh[0], 0].tolist() == [0, 0]  # where it was resumed
 
 
@@ -263,7 +265,7 @@ def test_it_learns():
     """Two numbers to be said, by their rewards alone: an untrained pair loses some 20 an episode, this one a few."""
     small = {"total_steps": 8000, "learning_starts": 500, "num_envs": 4, "rollout_length": 5, "batch_size": 64}
     small |= {"log_every": 1000, "eval_every": 4000, "replay_capacity": 8000}
-    result = matd3_jax.train("algo.hidden=[32]", "algo.lr=0.003", "algo.gamma=0.5", env=guess(), seeds=2, **small)
+    result = matd3_jax.train("algo.hidden=[32]", "algo.lr=0.003", "algo.gamma=0.1", env=guess(), seeds=2, **small)
     returns = result.metrics["eval_return_agents"]
     assert (returns[:, 0] < -12).all() and (returns[:, -1] > -6).all(), returns
 

@@ -45,9 +45,9 @@ def main(argv: Sequence[str]) -> int:
 
 def _train(recorder: Recorder, given: arguments.Train) -> Recorded:
     if given.resume is not None:
-        settings = [text for text in given.settings if text != UNPICKLE]
-        unpickle = len(settings) < len(given.settings)
-        return recorder.resume(given.resume, given.checkpoint, _total_steps(settings), unpickle=unpickle)
+        others = [text for text in given.settings if text != UNPICKLE]
+        unpickle = len(others) < len(given.settings)
+        return recorder.resume(given.resume, given.checkpoint, _total_steps(others), unpickle=unpickle)
     if given.checkpoint is not None:
         raise UserError("checkpoint= goes with resume=RUN_DIR")
     settings = config.load(given.settings, arguments.TRAIN.keys)

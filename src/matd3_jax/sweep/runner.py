@@ -253,7 +253,7 @@ class Batch:
                 self.watch.log(row)
             return state, row, True
         saved = Path(broadcast(str(checkpoint.verify(self.checkpoints)) if first else None))
-        for line in host_states.notes(saved, self.training.trainer, unpickle=False) if first else ():
+        for line in host_states.notes(saved, self.training.trainer, unpickle=False, sweep=True) if first else ():
             say(line)
         state, done = checkpoint.restore(saved, self.training.trainer, self.training.share), int(saved.name)
         self.processes.barrier()

@@ -58,11 +58,17 @@ def restored(checkpoint: Path, trainer: TrainLoop, state: TrainState, share: Sha
     return state._replace(env=state.env._replace(state=state.env.state._replace(number=everywhere)))
 
 
-def notes(checkpoint: Path, trainer: TrainLoop, unpickle: bool) -> list[str]:
-    """What is to be said of the environments when a run is resumed: a line, or none."""
+def notes(checkpoint: Path, trainer: TrainLoop, unpickle: bool, sweep: bool = False) -> list[str]:
+    """What is to be said of the environments when a run is resumed: a line, or none.
+
+    Args:
+        sweep: it is one of a sweep, which never unpickles.
+    """
     env = _on_host(trainer)
     if env is None:
         return []
+    if sweep:
+        return [f"note: the episodes of {env.name} start anew"]
     if _pickled(checkpoint):
         if unpickle:
             return []

@@ -1,8 +1,10 @@
 """What all environments on the host share: states that stand for copies in a pool, and the callbacks that move them."""
 
 import abc
+import contextlib
 import io
 import os
+from collections.abc import Iterator
 from functools import cached_property
 from typing import NamedTuple
 
@@ -14,7 +16,7 @@ import numpy as np
 from matd3_jax.envs.environment import Environment, TimeStep
 from matd3_jax.envs.host import pickling
 from matd3_jax.envs.host.call import bits, call, floats
-from matd3_jax.envs.host.pool import TERMINATED, TRUNCATED, Pool, Simulation
+from matd3_jax.envs.host.pool import TERMINATED, TRUNCATED, Pool, Simulation, quiet
 from matd3_jax.envs.spaces import Box
 from matd3_jax.errors import OptionError
 
@@ -179,13 +181,32 @@ class HostEnvironment(Environment):
         """Numbers of new copies that go on from what `dump` gave. Unpickling runs what the bytes say: trust them."""
         return self.pool.load(pickling.loads(dumped))
 
-    def check_pickle(self) -> None:
-        """Raise OptionError unless a copy in the middle of an episode can be pickled."""
-        used = self.pool.reset(np.zeros(1, np.int32))[:, 0].tolist()
+    def begin(self) -> None:
+        """Make the pool, before several devices ask for it at the same time.
+
+        Raises OptionError where the copies are to be pickled, and one in the middle of an episode cannot be.
+        """
+        pool = self.pool
+        if not self.pickle:
+            return
+        used = pool.reset(np.zeros(1, np.int32))[:, 0].tolist()
         try:
             used += self.load(self.dump(np.array(used))).tolist()
         finally:
-            self.pool.release(used)
+            pool.release(used)
+
+
+@contextlib.contextmanager
+def asking(name: str) -> Iterator[None]:
+    """Where an environment is tried for the first time: OptionError for whatever its own code raises."""
+    try:
+        with quiet():
+            yield
+    except OptionError:
+        raise
+    except Exception as error:
+        words = " ".join(str(error).split())
+        raise OptionError(f"{name} cannot be played: {type(error).__name__}: {words}") from error
 
 
 def cores() -> int:

@@ -26,7 +26,7 @@ def loads(dumped: bytes) -> Any:
 
 
 def _bare(cls: type) -> Any:
-    return cls.__new__(cls)
+    return object.__new__(cls)
 
 
 def _set_attributes(obj: Any, attributes: dict[str, Any]) -> None:

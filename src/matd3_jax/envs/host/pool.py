@@ -17,7 +17,7 @@ from matd3_jax.errors import HostError
 TERMINATED, TRUNCATED = 1, 2
 """Bits of how an episode ended."""
 
-REMEMBERED = 1024
+REMEMBERED = 256
 """Copies that were given back whose last answer is kept."""
 
 

@@ -11,33 +11,12 @@ import numpy as np
 
 from matd3_jax.envs.environment import check_choice, check_count
 from matd3_jax.envs.host import sharing, sources
-from matd3_jax.envs.host.environment import HostEnvironment, HostState, cores
-from matd3_jax.envs.host.pool import Outcome, quiet
+from matd3_jax.envs.host.environment import HostEnvironment, HostState, asking, cores
+from matd3_jax.envs.host.pool import quiet
 from matd3_jax.envs.host.sharing import Shares
-from matd3_jax.envs.host.spaces import Actions, flat_size, flatten
+from matd3_jax.envs.host.single_simulation import Facts, SingleSimulation, ask
 from matd3_jax.envs.spaces import ActionSpace, Box
 from matd3_jax.errors import OptionError, nearest
-
-VELOCITY = "x_velocity"
-"""What gymnasium's walking robots call their speed in the information of a step."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Facts:
-    """What is known of an environment before it is played."""
-
-    action: Actions
-    observation: Any
-    """gymnasium's space."""
-    size: int
-    limit: int | None
-    """Env steps after which it truncates."""
-    model: Any
-    """`mujoco.MjModel` of a robot; None of others."""
-    skipped: int | None
-    """Positions that the observation leaves out where it begins with positions and velocities; None: it does not."""
-    speed: bool
-    """Whether steps tell a forward velocity."""
 
 
 class _Single(HostEnvironment):
@@ -59,8 +38,7 @@ class _Single(HostEnvironment):
         if self.split != "single" and not isinstance(facts.action.ours, Box):
             raise OptionError(f"split={self.split!r}: {self.name} takes {facts.action.ours}; only a Box can be shared")
         self.shares, self.observed  # noqa: B018  # raise for what is impossible
-        if self.pickle:
-            self.check_pickle()
+        self.begin()
 
     @abc.abstractmethod
     def _source(self) -> tuple[Callable[[], Any], Any]:
@@ -72,14 +50,14 @@ class _Single(HostEnvironment):
         make, first = self._source()
         if not is_gymnasium(first):
             raise OptionError(f"{self.name} gives a {type(first).__name__}, which is no gymnasium environment")
-        with quiet():
+        with asking(self.name):
             return make, ask(first, self.name), [first]
 
     @property
     def facts(self) -> Facts:
         return self._made[1]
 
-    def simulation(self) -> "SingleSimulation":
+    def simulation(self) -> SingleSimulation:
         make, facts, first = self._made
         try:
             return SingleSimulation(first.pop(), facts)
@@ -224,7 +202,7 @@ class Gymnasium(_Single):
 
         def make() -> Any:
             limit = {} if self.episode_length is None else {"max_episode_steps": self.episode_length}
-            return gymnasium.make(self.id, disable_env_checker=True, **{**limit, **self.kwargs})
+            return gymnasium.make(str(self.id), disable_env_checker=True, **{**limit, **self.kwargs})
 
         try:
             with sources.without_greetings(), quiet():
@@ -276,63 +254,3 @@ def is_gymnasium(env: Any) -> bool:
         and all(hasattr(env, name) for name in ("reset", "step", "observation_space", "action_space"))
         and not callable(env.action_space)
     )
-
-
-def ask(env: Any, name: str) -> Facts:
-    """What an environment is. It is reset, and stepped once."""
-    actions = Actions.of(env.action_space, name)
-    size = flat_size(env.observation_space, name)
-    observation, _ = env.reset(seed=0)
-    model = getattr(getattr(env, "unwrapped", env), "model", None)
-    data = getattr(getattr(env, "unwrapped", env), "data", None)
-    if not (hasattr(model, "nq") and hasattr(model, "actuator_trnid") and hasattr(data, "qpos")):
-        model, skipped = None, None
-    else:
-        skipped = _skipped(flatten(env.observation_space, observation), data)
-    spec = getattr(env, "spec", None)
-    limit = getattr(spec, "max_episode_steps", None)
-    *_, info = env.step(actions.back(np.zeros(actions.width, np.int32)))
-    return Facts(actions, env.observation_space, size, limit, model, skipped, VELOCITY in info)
-
-
-def _skipped(observation: np.ndarray, data: Any) -> int | None:
-    """How many positions an observation leaves out that begins with the others and all velocities."""
-    for skipped in range(data.qpos.size):
-        begin = np.concatenate([data.qpos[skipped:], data.qvel]).astype(np.float32)
-        if len(observation) >= len(begin) and np.array_equal(observation[: len(begin)], begin):
-            return skipped
-    return None
-
-
-class SingleSimulation:
-    """One copy of a gymnasium environment."""
-
-    def __init__(self, env: Any, facts: Facts):
-        self.env, self.facts = env, facts
-        self.observation: Any = None
-        self.speed = 0.0
-
-    def reset(self, seed: int) -> None:
-        self.observation, _ = self.env.reset(seed=seed)
-        self.speed = 0.0
-
-    def step(self, action: np.ndarray) -> Outcome:
-        played = self.facts.action.back(action)
-        self.observation, reward, terminated, truncated, info = self.env.step(played)
-        self.speed = float(info.get(VELOCITY, 0.0))
-        return Outcome(np.array([reward], np.float32), bool(terminated), bool(truncated))
-
-    def seen(self) -> np.ndarray:
-        facts = self.facts
-        parts = [flatten(facts.observation, self.observation)]
-        if facts.speed:
-            parts.append(np.array([self.speed], np.float32))
-        if facts.model is not None:
-            parts.append(np.asarray(self.env.unwrapped.data.qpos, np.float32))
-        return np.concatenate(parts)
-
-    def memory(self) -> Any:
-        return self.env, self.observation, self.speed
-
-    def remember(self, memory: Any) -> None:
-        self.env, self.observation, self.speed = memory
