@@ -17,7 +17,9 @@ def like(tree: Any, shapes: Any) -> Any:
 
     A `tree` of another structure is returned as it is, for `envs.check` to say so.
     """
-    if jax.tree.structure(tree) != jax.tree.structure(shapes):
+    found: Any = jax.tree.structure(tree)
+    wanted: Any = jax.tree.structure(shapes)
+    if found != wanted:
         return tree
     return jax.tree.map(lambda leaf, shape: jnp.asarray(leaf, shape.dtype), tree, shapes)
 
