@@ -146,9 +146,7 @@ def from_jaxmarl(env: Any, **options_: Any) -> Environment:
         >>> env.teams, env.observation_sizes
         (('adversaries', 'agents'), (8, 19))
     """
-    from matd3_jax.interop.from_jaxmarl import FromJaxMARL
-
-    return _with_options(FromJaxMARL, env, options_)
+    return _with_options(_class("..interop.from_jaxmarl", "FromJaxMARL"), env, options_)
 
 
 def _with_options(class_: Any, source: Any, given: dict[str, Any]) -> Environment:
@@ -162,5 +160,8 @@ def _with_options(class_: Any, source: Any, given: dict[str, Any]) -> Environmen
 def _find(name: str) -> Any:
     if name not in _CLASSES:
         raise OptionError(f"no environment is called {name!r}; {nearest(name, _CLASSES)}")
-    module, class_ = _CLASSES[name]
-    return getattr(importlib.import_module(module, __name__), class_)
+    return _class(*_CLASSES[name])
+
+
+def _class(module: str, name: str) -> Any:
+    return getattr(importlib.import_module(module, __name__), name)

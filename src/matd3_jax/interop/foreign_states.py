@@ -18,7 +18,8 @@ def like(tree: Any, shapes: Any) -> Any:
     A `tree` of another structure is returned as it is, for `envs.check` to say so.
     """
     found: Any = jax.tree.structure(tree)
-    if found != jax.tree.structure(shapes):
+    wanted: Any = jax.tree.structure(shapes)
+    if found != wanted:
         return tree
     return jax.tree.map(lambda leaf, shape: jnp.asarray(leaf, shape.dtype), tree, shapes)
 

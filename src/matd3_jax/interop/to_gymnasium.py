@@ -57,8 +57,7 @@ class VectorEnvironment(gymnasium.vector.VectorEnv):
         self._keys: Any = None
         """[num_envs] from which each copy's further random numbers come."""
         self._states: Any = None
-        shape: Any = self.observation_space.shape
-        self._observations = np.zeros(shape, np.float32)
+        self._observations: np.ndarray = np.zeros((num_envs, env.observation_sizes[0]), np.float32)
         self._over = np.zeros(num_envs, bool)
         self._resets, self._steps = jax.jit(self._reset_where), jax.jit(jax.vmap(self._step_one))
 
