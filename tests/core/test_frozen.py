@@ -14,8 +14,6 @@ from matd3_jax.envs import make
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.schedule import Schedule
 
-pytestmark = pytest.mark.usefixtures("quick_jit")
-
 LEARNER = Algorithm(hidden=(6,), smoothing=True)
 STILL = HYPER._replace(actor_lr=0.0, tau=0.0, exploration_noise=0.0, target_noise=0.0)
 

@@ -38,7 +38,7 @@ def folder(tmp_path_factory):
     return folder
 
 
-def test_command(folder, tmp_path, monkeypatch, capsys, quick_jit):
+def test_command(folder, tmp_path, monkeypatch, capsys):
     argv = [f"runs={folder}", f"out={tmp_path / 'out'}", "episodes=3", "deterministic=true"]
     assert cross_play.main(argv) == 0
     told = capsys.readouterr().out

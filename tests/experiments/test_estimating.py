@@ -15,7 +15,7 @@ from matd3_jax.sweep.runner import Sweep
 TINY = ["algo.hidden=[8]", "batch_size=16", "learning_starts=200", "replay_capacity=1000", "log_every=200"]
 
 
-def test_estimate_measures_and_writes_nothing(tmp_path, monkeypatch, capsys, quick_jit):
+def test_estimate_measures_and_writes_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(estimating, "EACH", 0.05)
     monkeypatch.setattr(estimating, "STEPS", 200)
     argv = ["scale=small", "only=simple_spread-maddpg", "seeds=2", "total_steps=1000000", *TINY]

@@ -25,7 +25,7 @@ def example():
 
 
 @pytest.mark.parametrize("lines", [["env.split=halves"], ["algo=td3", "env.split=2x4"]], ids=str)
-def test_an_episode_has_the_return_of_our_own_evaluation(example, lines, tmp_path, quick_jit):
+def test_an_episode_has_the_return_of_our_own_evaluation(example, lines, tmp_path):
     """From the same start: the first 20 env steps to 1e-3 by themselves, all 100 to 1e-4 on our episode's states.
 
     Our state is kept in float32 between env steps, and so is gymnasium's here; what is left apart are sums in another
@@ -61,7 +61,7 @@ def test_an_episode_has_the_return_of_our_own_evaluation(example, lines, tmp_pat
 
 
 @pytest.mark.slow
-def test_the_program_prints_a_mean(example, tmp_path, quick_jit, capsys):
+def test_the_program_prints_a_mean(example, tmp_path, capsys):
     training = TrainingSession(config.load(["env=ant", "seeds=1", "algo.hidden=[4]", "env.episode_length=20"]))
     saved = SavedPolicies(training.trainer.init(training.keys()), np.array([0]), np.array([True]), {})
     export(training, saved, 0, "numpy", tmp_path / "policies")

@@ -38,11 +38,6 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick(quick_jit):
-    """Every program of this module compiles with little optimization."""
-
-
 def untrained(lines) -> tuple[TrainingSession, SavedPolicies]:
     """A run's policies with weights as large as trained ones, and statistics of observations that say something."""
     settings = config.load([*lines, *SMALL, "algo.hidden=[12,10]"])

@@ -35,7 +35,7 @@ pytestmark = pytest.mark.skipif(bool(missing("wandb", "mlflow")), reason="needs 
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory, quick_jit) -> Path:
+def trained(tmp_path_factory) -> Path:
     """A run with trackers and films, and one without; the first resumed from its middle, and lengthened."""
     out = tmp_path_factory.mktemp("runs")
     where = [f"out={out}", f"mlflow.tracking_uri='{out / 'tracks'}'"]
@@ -213,7 +213,7 @@ def test_runs_of_a_sweep_are_runs_of_their_own(seeds, tmp_path, client, trained)
     assert len(tracked) == (6 if seeds == "runs" else 2) and {one.data.tags["sweep"] for one in tracked} == {"grid"}
 
 
-def test_without_a_network_or_a_login_a_run_is_trained_all_the_same(tmp_path, monkeypatch, quick_jit):
+def test_without_a_network_or_a_login_a_run_is_trained_all_the_same(tmp_path, monkeypatch):
     """W&B as it is: no key, and a server that does not answer; MLflow with a server that does not answer."""
     import matd3_jax
 

@@ -24,11 +24,6 @@ SMALL = [
 RUN = [*SMALL, "total_steps=1600", "algo.actor_average=0.2", "checkpoint_every=100", "keep_checkpoints=9"]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick(quick_jit):
-    """Every program of this module compiles with little optimization."""
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """A run with a checkpoint after each of its evaluations."""

@@ -44,7 +44,7 @@ class Noted:
 
 
 @pytest.fixture(scope="module")
-def filmed(tmp_path_factory, quick_jit) -> tuple[Path, Noted, list[str]]:
+def filmed(tmp_path_factory) -> tuple[Path, Noted, list[str]]:
     path, noted = tmp_path_factory.mktemp("films") / "run", Noted()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -68,7 +68,7 @@ def test_a_logger_gets_rows_films_figures_and_the_summary_though_it_failed(filme
     assert told == ["warning: Noted fails, the run goes on: ValueError: the first row"]
 
 
-def test_a_callback_ends_the_run(tmp_path, quick_jit):
+def test_a_callback_ends_the_run(tmp_path):
     """Unlike a logger: this is how a program stops one."""
 
     def stop(row):
@@ -128,7 +128,7 @@ def test_without_opengl_one_warning(tmp_path, monkeypatch):
     assert not (tmp_path / "videos").exists()
 
 
-def test_runs_of_a_sweep_are_filmed_each_by_its_own_setting(tmp_path, quick_jit):
+def test_runs_of_a_sweep_are_filmed_each_by_its_own_setting(tmp_path):
     given = [f"{key}={value}" for key, value in {**SMALL, "seeds": 1}.items()]
     settings = {
         name: config.load(["env=point_reach", "algo.hidden=[8]", f"algo.lr={rate}", f"video_every={every}", *given])

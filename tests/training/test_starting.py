@@ -29,11 +29,6 @@ SOURCE = [
 AGAINST = [*ENV, *SMALL, "seeds=3", "algo.hidden=[8]", "adversary.frozen=true"]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick(quick_jit):
-    """Every program of this module compiles with little optimization."""
-
-
 @pytest.fixture(scope="module")
 def source(tmp_path_factory):
     path = tmp_path_factory.mktemp("runs") / "the source"
