@@ -89,9 +89,9 @@ def cases(one: Command) -> Iterator[tuple[str, str]]:
 
 def needed(one: Command, key: str) -> list[str]:
     """What else must be given: a run that is not there."""
-    fields = dataclasses.fields(one.options)
-    required = [f.name for f in fields if "bounds" in f.metadata and f.default is dataclasses.MISSING]
-    return [f"{name}=nowhere" for name in required if name != key]
+    fields = [field for field in dataclasses.fields(one.options) if "bounds" in field.metadata]
+    required = [field for field in fields if field.default is dataclasses.MISSING and field.name != key]
+    return [f"{field.name}={bad_input.good(field.metadata['bounds'])}" for field in required]
 
 
 @pytest.mark.parametrize("name", arguments.COMMANDS)

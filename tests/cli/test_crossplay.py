@@ -162,7 +162,7 @@ BAD = {
     "seed": (["runs={0}/mixed", "seed=-1"], "seed=-1"),
     "pairing": (["runs={0}/mixed", "pairing=both"], "pairing=both: must be one of all, matched"),
     "deterministic": (["runs={0}/mixed", "deterministic=maybe"], "deterministic=maybe"),
-    "checkpoint": (["runs={0}/mixed", "checkpoint=last"], "checkpoint=last"),
+    "checkpoint": (["runs={0}/mixed", "checkpoint=newest"], "checkpoint=newest"),
     "out": (["runs={0}/mixed", "out={0}/mixed/config.yaml"], "out=.*cannot make"),
     "malformed": (["runs={0}/mixed", "episodes=[1"], r"episodes=\[1: must be a whole number"),
 }

@@ -4,6 +4,7 @@ import dataclasses
 import typing
 from pathlib import Path
 
+import bad_input
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -23,7 +24,8 @@ OPTIONS = [
 def needed(command, name) -> list[str]:
     """What else must be given."""
     fields = [field for field in dataclasses.fields(command.options) if "bounds" in field.metadata]
-    return [f"{f.name}=nowhere" for f in fields if f.default is dataclasses.MISSING and f.name != name]
+    required = [field for field in fields if field.default is dataclasses.MISSING and field.name != name]
+    return [f"{field.name}={bad_input.good(field.metadata['bounds'])}" for field in required]
 
 
 def fits(value, hint, bounds) -> bool:

@@ -324,7 +324,7 @@ CANNOT = {
     "a missing package": (["logger=[csv,tensorboard]"], "needs the package tensorboardX"),
     "memory": (["replay_capacity=100000000", "total_steps=100000000"], "GB are free"),
     "a file in the way": (["out={out}/file"], "cannot make this directory"),
-    "a name too long": (["name=" + 300 * "a"], "File name too long"),
+    "a name too long": (["name=" + 300 * "a"], "at most 255 bytes"),
     "a backslash": ([r"name=a\b"], "a path has a backslash"),
     "an environment that does not take its options": (["env.episode_length=0"], "episode_length"),
 }

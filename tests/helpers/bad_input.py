@@ -21,6 +21,11 @@ NO_BOOL = ("", "x", "2", "-1", "nan", "yes ", "[true]", "{a:true}", "tru\u00e9",
 NO_CHOICE = ("x", "nan", "-1", "[[x]]", "{a:1}", "\u00e9", "\x1b[31m", LONG)
 
 
+def good(bounds: Bounds) -> str:
+    """What an option may have that must be given: one of its choices, or a run that is not there."""
+    return "nowhere" if bounds.choices is None else str(next(iter(bounds.choices)))
+
+
 def beyond(kind: type, bounds: Bounds) -> Iterator[str]:
     """Numbers just outside and far outside of the bounds."""
     step = 1 if kind is int else 1e-6

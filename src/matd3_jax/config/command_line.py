@@ -6,13 +6,15 @@ from typing import Any
 
 from matd3_jax.config import diff
 from matd3_jax.config.load import load
-from matd3_jax.config.schema import TEXTS, Config
+from matd3_jax.config.schema import Config
 from matd3_jax.errors import UserError
+
+PLACE = ("name", "out")
 
 
 def overrides(config: Config) -> list[str] | None:
     """What `load` makes these settings of: files, and the values that differ from theirs; without the run's name and
-    place (`TEXTS`), which are taken.
+    place (`PLACE`), which are taken.
 
     None where no command line does: an environment that was given as an object, say.
     """
@@ -23,9 +25,9 @@ def overrides(config: Config) -> list[str] | None:
             names.append(f"recipe={config.recipe}")
         base = _flat(load(names).to_dict())
         wanted = _flat(config.to_dict())
-        other = {key: value for key, value in wanted.items() if base.get(key, _ABSENT) != value and key not in TEXTS}
+        other = {key: value for key, value in wanted.items() if base.get(key, _ABSENT) != value and key not in PLACE}
         found = [*names, *(_line(key, value) for key, value in other.items())]
-        same = dataclasses.replace(load(found), **{key: getattr(config, key) for key in TEXTS})
+        same = dataclasses.replace(load(found), **{key: getattr(config, key) for key in PLACE})
         return found if same == config else None
     except (UserError, KeyError):
         return None

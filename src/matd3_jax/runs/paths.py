@@ -43,7 +43,9 @@ def inside(parent: Path, name: str, key: str) -> Path:
     """
     found = parent / name
     if Path(name).is_absolute() or not all(map(_is_part, Path(name).parts or ("",))):
-        raise UserError(f"{key}={name}: must name a directory in {parent}")
+        long = any(len(os.fsencode(part)) > LONGEST_NAME for part in Path(name).parts if _has_bytes(part))
+        why = f": a name has at most {LONGEST_NAME} bytes" if long else ""
+        raise UserError(f"{key}={name}: must name a directory in {parent}{why}")
     return found
 
 
