@@ -74,10 +74,10 @@ def test_from_python_runs_without_a_batch_are_planned_again(tmp_path, monkeypatc
     settings = {name: config.load([*TINY, f"algo.lr={name}"]) for name in ("0.01", "0.1")}
     create, made = RunDirectory.create, []
 
-    def killing(path, *more):
+    def killing(path, *more, **others):
         if made:
             raise Killed
-        made.append(create(path, *more))
+        made.append(create(path, *more, **others))
 
     monkeypatch.setattr(RunDirectory, "create", killing)
     with pytest.raises(Killed):

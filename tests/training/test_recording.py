@@ -112,7 +112,9 @@ def test_a_metrics_table_that_is_lost_after_the_last_checkpoint_leaves_a_summary
     step = checkpoint.steps(copy / "checkpoints")[-1]
     assert sum("lacks rows between env steps" in line for line in said) == 1
     assert "has no rows: there are no means" in said[-1]
-    assert RunDirectory(copy).summary() == {"total_steps": step, "diverged": {}, "last_tenth": {}}
+    found = RunDirectory(copy).summary()
+    assert found.pop("best_evaluation").keys() == {"0", "1"}  # the checkpoint has these
+    assert found == {"total_steps": step, "diverged": {}, "last_tenth": {}}
     with pytest.raises(UserError, match="raise total_steps="):
         resume(copy)
 
@@ -197,10 +199,10 @@ def test_any_missing_file_of_a_checkpoint_is_named(copy):
     folder = copy / "checkpoints" / str(last)
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     parts = {path.relative_to(folder).parts[0] for path in files}
-    assert parts == {"state", "replay", "checksums.json"} and len(files) > 10
+    assert parts == {"state", "replay", "best", "checksums.json"} and len(files) > 10
     assert {path.name for path in files} >= {"_METADATA", "manifest.ocdbt", "checksums.json"}
     aside = copy / "aside"
-    for path in [*files, folder / "state", folder / "replay" / "0"]:
+    for path in [*files, folder / "state", folder / "replay" / "0", folder / "best"]:
         path.rename(aside)
         with pytest.raises(UserError) as error:
             resume(copy, total_steps=2000)
