@@ -202,11 +202,10 @@ def test_what_is_said_without_pickles(three, tmp_path):
     ("name", "options"),
     [
         ("pettingzoo", {"id": "mpe2.simple_tag_v3"}),
-        ("pettingzoo", {"id": "gymnasium_robotics.mamujoco_v1", "kwargs": {"scenario": "Ant", "agent_conf": "2x4"}}),
         ("gymnasium", {"id": "Hopper-v5", "split": "3x1"}),
         ("gymnasium", {"id": "CartPole-v1"}),
     ],
-    ids=["mpe2", "mamujoco", "mujoco", "classic"],
+    ids=["mpe2", "mujoco", "classic"],
 )
 def test_pickles_keep_where_environments_are(name, options):
     """Though they are EzPickles, which forget it: both go on alike, over the end of an episode, too."""
@@ -234,6 +233,9 @@ def test_what_cannot_be_pickled_is_refused_before_training():
 
     with pytest.raises(envs.OptionError, match="env.pickle=true: .*Local cannot be pickled .*not me"):
         envs.from_pettingzoo(Local, pickle=True)
+    with pytest.raises(envs.OptionError, match="cannot be pickled .*lambda.*; leave it false"):
+        kwargs = {"scenario": "Ant", "agent_conf": "2x4"}
+        envs.make("pettingzoo", id="gymnasium_robotics.mamujoco_v1", kwargs=kwargs, pickle=True)
 
 
 # ---- on the command line ---------------------------------------------------------------------------------------------
