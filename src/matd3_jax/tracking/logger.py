@@ -125,6 +125,8 @@ class TrackingLogger:
                 raise
             self._said.append(("warning", f"it has not taken everything after {self.patience:.0f} s"))
         self._threads[1].join(1)
+        if self._process.returncode:  # after everything was written: nobody found the pipe broken
+            self._said.append(("warning", f"its process ended (exit code {self._process.returncode})"))
         self._tell()
 
     def _send(self, message: Any) -> None:
