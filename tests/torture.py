@@ -150,7 +150,7 @@ class Torture:
         elif ended.code is None:
             how = "killed"
         elif "Traceback" in ended.output:
-            how = "ended with a traceback"
+            how, outcome, detail = "ended with a traceback", LOST, detail or ended.output[-1500:]
         else:
             how = "came to its end" if ended.code == 0 else "ended with one line"
         self.table[fault, how, outcome] += 1

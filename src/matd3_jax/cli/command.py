@@ -36,6 +36,7 @@ def start(name: str, argv: Sequence[str]) -> int:
 
 def code(main: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     """Run a command's `main`: its exit code, or 2 after an error line; a fault of our own passes."""
+    outside.leave_out_late_callbacks()
     try:
         return main(argv)
     except (UserError, OptionError) as error:
