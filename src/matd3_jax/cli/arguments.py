@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from matd3_jax import groups
+from matd3_jax.bounds import Bounds
 from matd3_jax.cli.options import WIDTH, Command, flag, number, option, others
 from matd3_jax.errors import UserError
 from matd3_jax.runs.paths import paths
@@ -86,7 +87,7 @@ def saved(texts: Sequence[str], key: str) -> int | str | None:
     if texts[0] == "best":
         return "best"
     step = number(texts[0], int)
-    if step is None or step < 0:
+    if step is None or not Bounds(least=0).admits(step):
         raise UserError(f"{key}={texts[0]}: must be the env step of a checkpoint, a whole number, or last, or best")
     return step
 
