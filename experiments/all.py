@@ -73,6 +73,7 @@ def main(argv: Sequence[str]) -> int:
     check_directory(given.out, "out")
     chosen = {name: one for name, one in STUDIES.items() if name not in given.skip}
     parsed = {name: study.parse(one, given.rest) for name, one in chosen.items()}
+    study.check_some(chosen.values(), given.rest)
     if any(options.estimate for options in parsed.values()):
         return _estimate(chosen, parsed, given)
     lines: list[str] = []

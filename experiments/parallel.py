@@ -104,8 +104,7 @@ def main(argv: Sequence[str]) -> int:
     check_directory(options.runs, "runs")
     check_directory(options.out, "out")
     names = [name for name in PARTS if name not in options.skip]
-    for name in names:
-        study.parse(STUDIES[name], options.rest)  # a mistake shows before anything starts
+    study.check_some([STUDIES[name] for name in names], options.rest)  # a mistake shows before anything starts
     stop = signals.Stop()
     parts = list(_parts(names, options))
     ended = _run(parts, options, stop)

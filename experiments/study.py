@@ -8,7 +8,7 @@ directories.
 import dataclasses
 import fnmatch
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -317,6 +317,21 @@ def _merged(line: Sequence[str], overrides: Sequence[str]) -> list[str]:
     """A setting's overrides, with the user's instead of those for the same keys."""
     keys = {override.key_or_group for override in config.parse(overrides)}
     return [*(text for text in line if key(text) not in keys), *overrides]
+
+
+def check_some(studies: Iterable[Study], overrides: Sequence[str]) -> None:
+    """Raise UserError for a setting that none of the studies takes, such as a misspelled option of theirs."""
+    errors = []
+    for study in studies:
+        options = parse(study, overrides)
+        settings = _overrides(options)
+        try:
+            for line in _checked(study, options, settings).values():
+                _load(tuple(_merged(line, settings)))
+            return
+        except UserError as error:
+            errors.append(error)
+    raise errors[0]
 
 
 def key_values(keys: Mapping[str, str], line: Sequence[str]) -> dict[str, Any]:

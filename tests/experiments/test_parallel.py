@@ -53,7 +53,7 @@ def test_time_that_is_over_ends_all(tmp_path, one_study, capsys):
 
 
 def test_mistakes_show_before_anything_starts(tmp_path, one_study):
-    for wrong in ("skip=smoothing", "scale=large", "processes=0"):
+    for wrong in ("skip=smoothing", "scale=large", "processes=0", "estimat=true", "algo.lrr=0.1"):
         with pytest.raises(UserError):
             parallel.main([f"runs={tmp_path / 'runs'}", wrong])
     assert not list(tmp_path.iterdir())

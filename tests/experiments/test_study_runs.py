@@ -193,6 +193,9 @@ def test_all_makes_one_summary(tmp_path, monkeypatch):
     assert "](target_smoothing/table.md)" in text and "Robots" not in text
     with pytest.raises(UserError, match="no experiment 'aunt'"):
         everything.main(["skip=aunt"])
+    with pytest.raises(UserError, match="no key 'estimat'"):
+        everything.main(["estimat=true", f"out={tmp_path / 'other'}"])
+    assert not (tmp_path / "other").exists()
 
 
 @pytest.mark.parametrize(
