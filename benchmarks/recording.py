@@ -9,6 +9,7 @@ The files go to a temporary directory in `folder`, and are deleted.
 """
 
 import dataclasses
+import functools
 import sys
 import tempfile
 import time
@@ -64,7 +65,7 @@ def main(argv: Sequence[str]) -> int:
         "machine": devices.description(),
         "versions": devices.versions(),
         "commit": commit(),
-        "settings": list(argv),
+        "settings": [*options.overrides],
         "rows": rows,
         "checkpoint": {
             **checkpoints,
@@ -111,25 +112,27 @@ def _checkpoints(training: TrainingSession, state: TrainState, path: Path, repea
     """Seconds (median) and bytes of a checkpoint whose replays are full, of random numbers as real rows compress no
     better."""
     trainer = training.trainer
-    key = jax.random.key(0)
-    full = [
-        jax.device_put(jax.random.uniform(key, shard.data.shape), shard.device)
-        for shard in state.replay.addressable_shards
-    ]
     shape, sharding = state.replay.shape, state.replay.sharding
+    state.replay.delete()  # a second one beside it need not fit
+    shards = []
+    for device, seeds in trainer.sharding.device_seeds():
+        rows = jax.device_put(jnp.zeros((len(seeds), *shape[1:]), jnp.float32, device=device), device)
+        for place, seed in enumerate(seeds):
+            rows = _fill(rows, jax.device_put(jax.random.key(seed), device), place)
+        shards.append(rows)
     rollouts = trainer.schedule.replay_capacity // trainer.schedule.rollout_steps
     state = state._replace(
-        replay=jax.make_array_from_single_device_arrays(shape, sharding, full),
+        replay=jax.make_array_from_single_device_arrays(shape, sharding, shards),
         rollouts=jax.device_put(jnp.int32(max(rollouts, int(state.rollouts))), state.rollouts.sharding),
     )
-    del full
+    del rows, shards
     seconds = []
     for number in range(repeats):
         begun = time.monotonic()
         saved = checkpoint.save(path / "checkpoints", number, trainer, state, keep=1)
         seconds.append(time.monotonic() - begun)
     size = sum(file.stat().st_size for file in saved.rglob("*") if file.is_file())
-    del state
+    state.replay.delete()
     begun = time.monotonic()
     jax.block_until_ready(checkpoint.restore(checkpoint.verify(path / "checkpoints"), trainer))
     return {
@@ -140,6 +143,12 @@ def _checkpoints(training: TrainingSession, state: TrainState, path: Path, repea
         "rows_of_a_seed": trainer.schedule.filled_rows(rollouts),
         "restore_seconds": time.monotonic() - begun,
     }
+
+
+@functools.partial(jax.jit, donate_argnums=0, static_argnums=2)
+def _fill(rows: jax.Array, key: jax.Array, place: int) -> jax.Array:
+    """Random numbers for the seed at a place of rows [seeds, capacity, row size]."""
+    return rows.at[place].set(jax.random.uniform(key, rows.shape[1:]))
 
 
 if __name__ == "__main__":
