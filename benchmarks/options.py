@@ -16,9 +16,10 @@ class Reported:
     out: Path | None = option("the report, as JSON", default=None, metavar="FILE.json", new_file=True)
 
     def write(self, report: Mapping[str, Any]) -> None:
-        """Write the report, if a file is wanted."""
+        """Write the report, if a file is wanted; of its "settings" not where it goes."""
         if self.out is not None:
-            files.write_json(self.out, report)
+            settings = [text for text in report.get("settings", ()) if not text.startswith("out=")]
+            files.write_json(self.out, {**report, **({"settings": settings} if "settings" in report else {})})
 
 
 @dataclasses.dataclass(frozen=True)

@@ -169,6 +169,7 @@ def test_recording_counts_the_replays_that_it_writes(tmp_path):
     found = json.loads(out.read_text())
     row_size = TrainingSession(config.load([*line, "total_steps=600"])).layout.row_size
     assert found["checkpoint"]["rows_of_a_seed"] == 400
+    assert found["settings"] == [*line, "total_steps=600"]  # nothing of this machine
     replays = 2 * 400 * row_size * 4
     assert replays < found["checkpoint"]["bytes"] < replays + 200_000
     assert [path.name for path in tmp_path.iterdir()] == ["report.json"]
