@@ -189,13 +189,14 @@ def parts_of(fact: Mapping[str, Any]) -> list[dict[str, Any]]:
     if "parts" in fact:
         return fact["parts"]
     first, number = fact["settings"]["seed"], fact["settings"]["seeds"]
+    own = {key: fact[key] for key in PART if key in fact}  # the first studies did not keep their commands
     summaries = fact["summary"].get("parts") if isinstance(fact["summary"], dict) else None
     if summaries is None:
-        return [{"seeds": [*range(first, first + number)], **{key: fact[key] for key in PART}}]
+        return [{"seeds": [*range(first, first + number)], **own}]
     # Of older data only the number of seeds is known, of which the parts have about as many each.
     ends = [first + number * k // len(summaries) for k in range(len(summaries) + 1)]
     pairs = zip(ends, ends[1:], summaries, strict=False)
-    return [{"seeds": [*range(a, b)], **{key: fact[key] for key in PART}, "summary": one} for a, b, one in pairs]
+    return [{"seeds": [*range(a, b)], **own, "summary": one} for a, b, one in pairs]
 
 
 def joined(facts: Sequence[Mapping[str, Any]], seeds: set[int]) -> dict[str, Any]:
