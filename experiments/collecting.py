@@ -74,7 +74,7 @@ class Data:
 
     def missing(self, label: str, wanted: Config) -> list[int]:
         """The seeds of these settings of which there are no finished data."""
-        asked = range(wanted.seed, wanted.seed + wanted.seeds)
+        asked = wanted.seed_numbers
         if label not in self.rows or self.unfinished(label):
             return [*asked]
         if differences(self.facts[label]["settings"], wanted.to_dict()):
@@ -161,7 +161,7 @@ def gather(keys: Mapping[str, str], paths: Sequence[Path], command: str, **how: 
 
     how: `keep`, `points` and `evaluations` of `tidy.from_metrics`.
     """
-    rows, facts, seeds = [], [], set[int]()
+    rows, facts, owned, seeds = [], [], [], set[int]()
     for path in paths:
         run, settings = RunDirectory.open(path)
         table = tidy.from_metrics(run.read_metrics(), key_values(keys, settings.to_dict()), **how)
@@ -176,8 +176,12 @@ def gather(keys: Mapping[str, str], paths: Sequence[Path], command: str, **how: 
             "machine": json.loads((path / "machine.json").read_text(encoding="utf-8")),
             "summary": json.loads(summary.read_text(encoding="utf-8")) if summary.exists() else UNFINISHED,
         }
-        facts.append({**fact, "parts": _only(fact, own)})
-    return tidy.concatenate(rows), joined(facts, seeds) if len(facts) > 1 else _without_parts(facts[0])
+        facts.append(fact)
+        owned.append(own)
+    if len(facts) == 1:
+        return rows[0], facts[0]
+    parts = [{**fact, "parts": _only(fact, own)} for fact, own in zip(facts, owned, strict=True)]
+    return tidy.concatenate(rows), joined(parts, seeds)
 
 
 PART = ("command", "machine", "summary")
@@ -214,7 +218,3 @@ def _only(fact: Mapping[str, Any], seeds: set[int]) -> list[dict[str, Any]]:
     if len(parts) == 1:
         return [{**parts[0], "seeds": sorted(seeds)}]
     return [{**part, "seeds": [seed for seed in part["seeds"] if seed in seeds]} for part in parts]
-
-
-def _without_parts(fact: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in fact.items() if key != "parts"}

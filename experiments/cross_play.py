@@ -128,7 +128,7 @@ def run_directories(folder: Path) -> dict[str, dict[tuple[str, str], list[Path]]
 
 
 def seeds_of(settings: Config) -> list[int]:
-    return list(range(settings.seed, settings.seed + settings.seeds))
+    return list(settings.seed_numbers)
 
 
 def planned(own: Runs, options: CrossPlayOptions) -> dict[str, Any]:

@@ -20,7 +20,6 @@ from experiments.all import STUDIES
 from experiments.study import RESULTS
 from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option, others
-from matd3_jax.errors import UserError, nearest
 from matd3_jax.runs.paths import check_directory
 from matd3_jax.runtime import signals
 from matd3_jax.runtime.terminal import say
@@ -45,7 +44,7 @@ class ParallelOptions:
     out: Path = option("the folder of the studies' results", default=RESULTS)
     processes: int = option("parts at once; memory and cores are shared out among them", default=4, least=1, most=64)
     minutes: float = option("after which what runs is ended", default=600.0, unit="minutes", above=0)
-    skip: tuple[str, ...] = option("studies to leave out", default=(), metavar="[NAME,NAME,...]")
+    skip: tuple[str, ...] = option("studies to leave out", default=(), choices=tuple(PARTS), metavar="[NAME,NAME,...]")
     cross_play: bool = option("play every team against every opponent of the competitive tasks", default=True)
     episodes: int = option("of each pair in cross-play", default=100, least=1)
     rest: tuple[str, ...] = others("an option of all studies (scale=, seeds=, ...), or a setting of all")
@@ -98,9 +97,6 @@ class Part:
 
 def main(argv: Sequence[str]) -> int:
     options = COMMAND.parse(argv)
-    for name in options.skip:
-        if name not in PARTS:
-            raise UserError(f"skip={name}: there is no study {name!r}; {nearest(name, PARTS)}")
     check_directory(options.runs, "runs")
     check_directory(options.out, "out")
     names = [name for name in PARTS if name not in options.skip]
@@ -152,7 +148,7 @@ def _environment(processes: int) -> dict[str, str]:
 
 
 def _run(parts: Sequence[Part], options: ParallelOptions, stop: signals.Stop) -> list[Part]:
-    """Run the parts, and cross-play after its part: those that came to their end."""
+    """Run the parts, and cross-play after its part: those that ended."""
     environment = _environment(options.processes)
     end = time.monotonic() + 60 * options.minutes
     waiting, running, ended = list(parts), [], []

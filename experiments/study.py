@@ -167,15 +167,13 @@ class Plan:
         for name, path in (("runs", folder), ("out", out)):
             check_directory(path, name)
         devices.prepare()
-        overrides = _overrides(options)
-        lines = {label: _merged(line, overrides) for label, line in _checked(study, options, overrides).items()}
-        wanted = {label: _load(tuple(line)) for label, line in lines.items()}
+        wanted = _wanted(study, options)
         data = collecting.read(*_files(study, out), study.keys)
         missing: dict[str, tuple[str, Config]] = {}
         if options.train:
-            chosen = [label for label in lines if fnmatch.fnmatch(label, options.only or "*")]
+            chosen = [label for label in wanted if fnmatch.fnmatch(label, options.only or "*")]
             if not chosen:
-                raise UserError(f"only={options.only}: matches none of {', '.join(lines)}")
+                raise UserError(f"only={options.only}: matches none of {', '.join(wanted)}")
             for label in chosen:
                 missing |= _runs(label, wanted[label], data, options.at_once)
             for name, (_, settings) in missing.items():
@@ -299,6 +297,13 @@ def folders(study: Study, options: StudyOptions) -> tuple[Path, Path]:
     return options.runs or folder, options.out or out
 
 
+def _wanted(study: Study, options: StudyOptions) -> dict[str, Config]:
+    """The study's settings by label. Raises UserError for overrides that it does not take."""
+    overrides = _overrides(options)
+    lines = _checked(study, options, overrides)
+    return {label: _load(tuple(_merged(line, overrides))) for label, line in lines.items()}
+
+
 def _checked(study: Study, options: StudyOptions, overrides: Sequence[str]) -> dict[str, list[str]]:
     """The study's settings. Raises UserError for overrides that they leave no room for."""
     lines = study.settings(options.scale, options)
@@ -323,11 +328,8 @@ def check_some(studies: Iterable[Study], overrides: Sequence[str]) -> None:
     """Raise UserError for a setting that none of the studies takes, such as a misspelled option of theirs."""
     errors = []
     for study in studies:
-        options = parse(study, overrides)
-        settings = _overrides(options)
         try:
-            for line in _checked(study, options, settings).values():
-                _load(tuple(_merged(line, settings)))
+            _wanted(study, parse(study, overrides))
             return
         except UserError as error:
             errors.append(error)

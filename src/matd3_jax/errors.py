@@ -19,6 +19,16 @@ class HostError(UserError):
     """
 
 
+def one_line(error: BaseException) -> str:
+    """An error's message without its line breaks."""
+    return " ".join(str(error).split())
+
+
+def described(error: BaseException) -> str:
+    """An error's type and message, in one line."""
+    return f"{type(error).__name__}: {one_line(error)}".rstrip()
+
+
 def nearest(word: object, known: Iterable[str]) -> str:
     """The end of an error message: what was probably meant, or else everything that is known."""
     known = sorted(known)

@@ -27,7 +27,7 @@ def main(argv: Sequence[str]) -> int:
     seeds_played = training.trainer.sharding.padded_seeds * training.trainer.sharding.devices_per_seed
     memory.check_playing(training.env, training.layout, options.episodes, seeds_played, devices.free_memory())
     saved = saved_policies.load(run, training, options.checkpoint)
-    state, diverged, numbers = saved.state, saved.diverged, np.arange(settings.seed, settings.seed + settings.seeds)
+    state, diverged, numbers = saved.state, saved.diverged, np.array(settings.seed_numbers)
     sound = ~np.isin(numbers, list(diverged))
     whose = f", of {divergence.of_seeds(settings.seeds, diverged)}" if diverged else ""
     table = Table(title=f"{run.path}, {saved.when}: means of {options.episodes} episodes a seed{whose}")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from matd3_jax.cli import arguments, command
-from matd3_jax.errors import UserError
+from matd3_jax.errors import UserError, one_line
 from matd3_jax.figures import learning_curves
 from matd3_jax.figures.learning_curves import Line, Panel
 from matd3_jax.reporting import facts, page, sections
@@ -139,5 +139,5 @@ def _played(run: Run, path: Path) -> str | None:
         shown = played.at(math.ceil(played.length / PICTURES))
         encode.write(path, frames.compose(drawing, shown.states, shown.captions(), 320), drawing.fps)
     except Exception as error:  # whatever is wrong with its checkpoint, the page has the rest
-        return " ".join(str(error).split())
+        return one_line(error)
     return None

@@ -29,7 +29,7 @@ from matd3_jax.config.schema import (
     WandbConfig,
 )
 from matd3_jax.config.validate import check
-from matd3_jax.errors import OptionError, UserError, nearest
+from matd3_jax.errors import OptionError, UserError, nearest, one_line
 from matd3_jax.groups import GROUPS, known_names
 from matd3_jax.runtime import files
 
@@ -350,4 +350,4 @@ def _one_line(error: BaseException) -> str:
     if isinstance(error, OmegaConfBaseException):
         key = f"{error.full_key}: " if error.full_key else ""
         return key + str(error).split("\n")[0]
-    return " ".join(str(error).split())
+    return one_line(error)

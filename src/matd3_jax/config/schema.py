@@ -186,6 +186,11 @@ class Config:
         """The algorithm of each team."""
         return {"agents": self.algo, "adversaries": self.adversary or self.algo}
 
+    @property
+    def seed_numbers(self) -> range:
+        """The numbers of the seeds."""
+        return range(self.seed, self.seed + self.seeds)
+
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as `from_dict` takes them."""
         return plain(dataclasses.asdict(self))

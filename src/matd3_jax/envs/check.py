@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from matd3_jax.envs.environment import Environment, TimeStep
 from matd3_jax.envs.spaces import Box, Discrete, MultiDiscrete, Simplex
-from matd3_jax.errors import UserError
+from matd3_jax.errors import UserError, one_line
 
 TEAMS = ("agents", "adversaries")
 
@@ -130,7 +130,7 @@ class _Check:
         except UserError:
             raise
         except Exception as error:  # whatever the environment's own code raises
-            words = " ".join(str(error).split())
+            words = one_line(error)
             short = words if len(words) <= 300 else words[:300] + "..."
             raise UserError(f"{self.name}: {name} cannot be traced by JAX: {type(error).__name__}: {short}") from error
 

@@ -14,13 +14,13 @@ from matd3_jax.envs.environment import Environment, TimeStep, check_count
 from matd3_jax.envs.host.sources import Kwargs
 from matd3_jax.envs.robots.quiet import quiet, quiet_mujoco
 from matd3_jax.envs.spaces import ActionSpace
-from matd3_jax.errors import OptionError, nearest
+from matd3_jax.errors import OptionError, nearest, one_line
 from matd3_jax.interop.foreign_states import flat, like, raw
 from matd3_jax.interop.import_jaxmarl import import_jaxmarl
 from matd3_jax.interop.jaxmarl_facts import Facts, facts
 
 MABRAX = ("ant_4x2", "halfcheetah_6x1", "hopper_3x1", "humanoid_9|8", "walker2d_2x3")
-"""Ids of JaxMARL's environments in brax, which reset by themselves unless they are told not to."""
+"""Ids of JaxMARL's environments in brax, which reset by themselves unless `auto_reset=False`."""
 
 
 class JaxMARLState(NamedTuple):
@@ -190,8 +190,7 @@ def _make(id: str | None, kwargs: Kwargs) -> Any:
         with quiet(), quiet_mujoco(), jax.ensure_compile_time_eval():
             return jaxmarl.make(id, **given)
     except Exception as error:  # whatever its constructor raises for options that it does not take
-        words = " ".join(str(error).split())
-        raise OptionError(f"env.id={id}: JaxMARL cannot make it with kwargs={given}: {words}") from error
+        raise OptionError(f"env.id={id}: JaxMARL cannot make it with kwargs={given}: {one_line(error)}") from error
 
 
 def _limit(env: Any, given: int | None) -> int:

@@ -18,7 +18,7 @@ from matd3_jax.envs.environment import LIMIT, Environment, TimeStep, check_choic
 from matd3_jax.envs.host.sources import Kwargs
 from matd3_jax.envs.robots.quiet import quiet, quiet_mujoco
 from matd3_jax.envs.spaces import Box
-from matd3_jax.errors import OptionError, nearest
+from matd3_jax.errors import OptionError, nearest, one_line
 from matd3_jax.interop.foreign_states import flat, like, raw
 from matd3_jax.interop.playground_layout import owners
 from matd3_jax.interop.playground_split import Split, as_split, share_out
@@ -244,7 +244,7 @@ def _load(id: str | None, impl: str, kwargs: Kwargs) -> Loaded:
         with quiet(), jax.default_matmul_precision("highest"):
             state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
     except Exception as error:  # whatever the task's own code raises
-        words = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+        words = f"{type(error).__name__}: {one_line(error)[:300]}"
         if downloads and not _menagerie().exists():
             raise OptionError(
                 f"env.id={id} needs the robots' models, which Playground could not download ({words}): git clone "

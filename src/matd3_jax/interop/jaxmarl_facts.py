@@ -12,7 +12,7 @@ import numpy as np
 
 from matd3_jax.envs.robots.quiet import quiet
 from matd3_jax.envs.spaces import ActionSpace, Box, Discrete, MultiDiscrete
-from matd3_jax.errors import OptionError
+from matd3_jax.errors import OptionError, one_line
 
 UNLIMITED = 2**30
 """Env steps of a time limit that is never reached."""
@@ -78,7 +78,7 @@ def facts(env: Any) -> Facts:
     except OptionError:
         raise
     except Exception as error:  # whatever the environment's own code raises, or what is not a dictionary
-        words = " ".join(str(error).split())[:300]
+        words = one_line(error)[:300]
         raise OptionError(f"{name} does not keep JaxMARL's interface: {type(error).__name__}: {words}") from error
     flags = {key: infos[key] for key in ("truncation", "truncated") if key in infos}
     truncation = next((key for key, value in flags.items() if getattr(value, "shape", None) == ()), None)

@@ -35,7 +35,7 @@ LAYOUTS: dict[str, Blocks] = {
     "T1JoystickFlatTerrain": _BIPED,
     "T1JoystickRoughTerrain": _BIPED,
 }
-"""Of the tasks where all that belongs to an actuator can be told (playground 0.2.0)."""
+"""Of the tasks where all that belongs to an actuator can be distinguished (playground 0.2.0)."""
 
 
 def owners(id: str, mj_model: Any, size: int) -> tuple[int | None, ...] | None:

@@ -132,11 +132,11 @@ class VectorEnvironment(gymnasium.vector.VectorEnv):
         self._over = self._over & ~mask
 
     def _reset_where(self, keys: Any, states: Any, observations: Any, mask: Any) -> Any:
-        def one(key: Any, state: Any, observation: Any, anew: Any) -> Any:
+        def one(key: Any, state: Any, observation: Any, chosen: Any) -> Any:
             next_key, now = jax.random.split(key)
             new_state, (new_observation,) = self.env.reset(now)
             new, old = (next_key, new_state, new_observation), (key, state, observation)
-            return jax.tree.map(lambda a, b: jnp.where(anew, a, b), new, old)
+            return jax.tree.map(lambda a, b: jnp.where(chosen, a, b), new, old)
 
         return jax.vmap(one)(keys, states, observations, mask)
 

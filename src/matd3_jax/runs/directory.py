@@ -256,7 +256,7 @@ def together(paths: Sequence[Path]) -> dict[str, np.ndarray]:
         for key in differing([first, learning(settings)])[:1]:
             here, there = text(learning(settings).get(key)), text(first.get(key))
             raise UserError(f"{run.path} is no run with other seeds of {paths[0]}: {key}={here}, not {there}")
-        for seed in range(settings.seed, settings.seed + settings.seeds):
+        for seed in settings.seed_numbers:
             if seed in owner:
                 raise UserError(f"{owner[seed]} and {run.path} have the same settings and both the seed {seed}")
             owner[seed] = run.path

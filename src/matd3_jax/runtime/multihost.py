@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, Self
 import jax
 import numpy as np
 
-from matd3_jax.errors import UserError
+from matd3_jax.errors import UserError, one_line
 from matd3_jax.private import coordination_service
 from matd3_jax.runtime import devices, slurm
 from matd3_jax.runtime.terminal import say
@@ -185,7 +185,7 @@ class Processes:
         if error is None:
             self.barrier()
         elif not isinstance(error, Left):
-            text = " ".join(str(error).split()) if isinstance(error, UserError) else repr(error)
+            text = one_line(error) if isinstance(error, UserError) else repr(error)
             self._client.key_value_set(f"{LEFT}/{self.index}", text)
 
 

@@ -7,6 +7,7 @@ import traceback
 from typing import Any
 
 import matd3_jax
+from matd3_jax.errors import one_line
 
 _IN_A_MESSAGE = re.compile(r"os_error_code='(\d+)'")
 _ON_HOST = re.compile(r"\bHostError: (.*)")
@@ -38,7 +39,7 @@ def describe(error: BaseException) -> str | None:
     on_host = _ON_HOST.search(str(error))
     if on_host:
         return on_host[1]
-    text = " ".join(str(error).split())
+    text = one_line(error)
     if isinstance(error, OSError):
         return _of_the_system(error, text)
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in text:

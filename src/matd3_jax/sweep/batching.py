@@ -38,7 +38,7 @@ def missing(config: Config, existing: Mapping[str, Config]) -> tuple[list[str], 
 
     Raises UserError where two of them have the same seed.
     """
-    wanted = range(config.seed, config.seed + config.seeds)
+    wanted = config.seed_numbers
     names: list[str] = []
     there: set[int] = set()
     for name, other in existing.items():
@@ -58,7 +58,7 @@ def check_seeds(settings: Mapping[str, Config]) -> None:
     owners: dict[tuple[str, int], str] = {}
     for name, config in settings.items():
         same = json.dumps(bare(config).to_dict())
-        for seed in range(config.seed, config.seed + config.seeds):
+        for seed in config.seed_numbers:
             owner = owners.setdefault((same, seed), name)
             if owner != name:
                 raise UserError(

@@ -213,7 +213,7 @@ class Batch:
         self.watch = DivergenceLogger(
             self.training,
             say,
-            names=[f"{c.name}: seed {seed}" for c in self.members for seed in range(c.seed, c.seed + c.seeds)],
+            names=[f"{c.name}: seed {seed}" for c in self.members for seed in c.seed_numbers],
         )
 
     def train(self, stop: Stop) -> None:
@@ -279,8 +279,8 @@ class Batch:
         saved = Path(broadcast(str(checkpoint.verify(self.checkpoints)) if first else None))
         for line in host_states.notes(saved, self.training.trainer, unpickle=False, sweep=True) if first else ():
             say(line)
-        state, done = checkpoint.restore(saved, self.training.trainer, self.training.share), int(saved.name)
-        self.training.best.restore(saved, self.training.share)
+        training, done = self.training, int(saved.name)
+        state = checkpoint.restore(saved, training.trainer, training.share, best=training.best)
         self.processes.barrier()
         for run, config, own in zip(self.runs, self.members, self.seeds, strict=True) if first else ():
             for line in run.cut(done, self.training.expected_table(config)):
@@ -306,7 +306,7 @@ class Batch:
                 if seeds.start <= place < seeds.stop
             }
             settings = str(config.name), config.diagnostics.q_bias
-            own_facts = {**facts, **best_evaluations.summary(saved, range(config.seed, config.seed + config.seeds))}
+            own_facts = {**facts, **best_evaluations.summary(saved, config.seed_numbers)}
             found = finish.finish(run, self.training.layout, *settings, done, own_facts, diverged)
             out.finish(number, found)
 

@@ -48,7 +48,7 @@ class TrackingLogger:
     """Sends rows, pictures, films and summaries to a tracker, through a process of its own.
 
     Whatever happens to the tracker, the training goes on: nothing here waits but `close`, and that for `PATIENCE` at
-    most. The first thing that goes wrong is told of in one line, when the next row comes.
+    most. The first thing that goes wrong is reported in one line, when the next row comes.
 
     Args:
         kind: one of `NAMES`.

@@ -28,7 +28,7 @@ class MlflowBackend:
     def __init__(self) -> None:
         for name, value in PATIENCE.items():
             os.environ.setdefault(name, value)
-        # Directories are for those who ask for one; MLflow 3 wants to be told so.
+        # Directories are for those who ask for one; MLflow 3 wants a variable for that.
         os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")
         import mlflow
 

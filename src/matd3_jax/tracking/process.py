@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, TextIO
 
+from matd3_jax.errors import described
 from matd3_jax.tracking import messages
 from matd3_jax.tracking.backend import Backend
 from matd3_jax.tracking.messages import FAILED, Attached, Closed, Logged, Summarized, TrackedRun
@@ -133,7 +134,7 @@ class Tracking:
             self._warn(error)
 
     def _warn(self, error: Exception) -> None:
-        self._say("warning", " ".join(f"{type(error).__name__}: {error}".split()))
+        self._say("warning", described(error))
 
     def _say(self, what: str, line: str) -> None:
         try:

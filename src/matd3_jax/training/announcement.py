@@ -14,7 +14,7 @@ ENGINES = {"c": "C MuJoCo", "mjx": "MuJoCo in JAX", "mjx_fast": "MuJoCo in JAX w
 """What a robot's `physics` may be."""
 
 SHOWN = 8
-"""Seeds, at most, whose best evaluations are told of."""
+"""Seeds, at most, whose best evaluations are reported."""
 
 
 def first_lines(training: TrainingSession, run: RunDirectory, done: int = 0) -> list[str]:

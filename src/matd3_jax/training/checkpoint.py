@@ -193,7 +193,13 @@ def damage(path: Path) -> str | None:
         return "checksums.json"
 
 
-def restore(path: Path, trainer: TrainLoop, share: Share | None = None, unpickle: bool = False) -> TrainState:
+def restore(
+    path: Path,
+    trainer: TrainLoop,
+    share: Share | None = None,
+    unpickle: bool = False,
+    best: BestPolicies | None = None,
+) -> TrainState:
     """The state in the checkpoint at `path`, as `verify` gave it. Raises UserError if it holds no replay or does not
     fit the trainer.
 
@@ -201,6 +207,7 @@ def restore(path: Path, trainer: TrainLoop, share: Share | None = None, unpickle
         share: which of the checkpoint's seeds the trainer has; None: all.
         unpickle: let environments on the host go on from their pickles, where there are any; what is unpickled can run
             any program. Otherwise they start new episodes.
+        best: gets the policies of the best evaluations up to there.
     """
     if not (path / "replay").is_dir():
         raise UserError(f"{path} holds no replay: what a sweep leaves of a run can be evaluated, not resumed")
@@ -222,6 +229,8 @@ def restore(path: Path, trainer: TrainLoop, share: Share | None = None, unpickle
             local.append(rows)
     shape = (trainer.sharding.padded_seeds, trainer.schedule.replay_capacity, trainer.layout.row_size)
     rows = jax.make_array_from_single_device_arrays(shape, trainer.shardings.replay, local)
+    if best is not None:
+        best.restore(path, share)
     return host_states.restored(path, trainer, small._replace(replay=rows), share, unpickle)
 
 

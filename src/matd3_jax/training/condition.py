@@ -117,8 +117,7 @@ def _expected(settings: Config, table: MetricsTable) -> Expected:
     try:
         return TrainingSession(settings).expected_table(settings)
     except (UserError, OptionError):  # an environment of one's own, or one that is not installed here
-        seeds = range(settings.seed, settings.seed + settings.seeds)
-        return Expected(table.header, seeds, first=0, interval=0)
+        return Expected(table.header, settings.seed_numbers, first=0, interval=0)
 
 
 def _readable(path: Path) -> bool:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from matd3_jax.config import Config
+from matd3_jax.errors import one_line
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import TrainState
@@ -25,7 +26,7 @@ class Filmer:
     """Plays the first evaluation episode with the first sound seed of each run, and leaves `videos/STEP.gif`.
 
     Training does not depend on it: the keys are those of evaluations, and the state is only read. Whatever keeps a film
-    from being made (no OpenGL for a robot, an environment that cannot be drawn, a full disk) is told of once, and then
+    from being made (no OpenGL for a robot, an environment that cannot be drawn, a full disk) is reported once, and then
     none is tried again.
 
     Args:
@@ -67,7 +68,7 @@ class Filmer:
                     self.attach(number, step, path, config.seed + seed - seeds.start)
             except Exception as error:  # a film is never a reason to end a run
                 self.failed = True
-                self.tell(f"warning: no films are made any more: {' '.join(str(error).split())[:300]}")
+                self.tell(f"warning: no films are made any more: {one_line(error)[:300]}")
 
     def _sound(self, state: TrainState, seeds: slice) -> int | None:
         """The first of a run's seeds, of those in this process, whose networks are finite."""

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from matd3_jax.errors import UserError
+from matd3_jax.errors import UserError, described
 from matd3_jax.runtime.multihost import Share
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.state import TrainState
@@ -49,10 +49,8 @@ def restored(checkpoint: Path, trainer: TrainLoop, state: TrainState, share: Sha
         try:
             numbers.append(env.load(file.read_bytes()))
         except Exception as error:  # whatever the environment's own code raises
-            words = " ".join(str(error).split())
             raise UserError(
-                f"{file} cannot be unpickled ({type(error).__name__}: {words}); resume without env.pickle=true: "
-                "episodes start anew"
+                f"{file} cannot be unpickled ({described(error)}); resume without env.pickle=true: episodes start anew"
             ) from error
     everywhere = jax.device_put(np.stack(numbers), trainer.shardings.env)
     return state._replace(env=state.env._replace(state=state.env.state._replace(number=everywhere)))

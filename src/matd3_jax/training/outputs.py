@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 
 from matd3_jax.config import Config
-from matd3_jax.errors import UserError
+from matd3_jax.errors import UserError, described
 from matd3_jax.runs import summary
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.tracking import logger as tracking
@@ -37,7 +37,7 @@ def check(settings: Config, recorded: bool = True) -> None:
 
 
 class Harmless:
-    """A logger whose errors are told of once, and end no run."""
+    """A logger whose errors are reported once, and end no run."""
 
     def __init__(self, logger: Any, tell: Tell):
         self.logger, self.tell = logger, tell
@@ -65,7 +65,7 @@ class Harmless:
         except Exception as error:
             if not self.warned:
                 self.warned = True
-                why = " ".join(f"{type(error).__name__}: {error}".split())
+                why = described(error)
                 self.tell(f"warning: {type(self.logger).__name__} fails, the run goes on: {why[:300]}")
 
 
@@ -96,7 +96,7 @@ class Outputs:
     ):
         self.runs = runs
         self.how = FAILED
-        """What trackers are told at the end, one of `tracking.messages`."""
+        """How the runs were left, for trackers: one of `tracking.messages`."""
         self.own = [Harmless(logger, tell) for logger in own]
         # Runs of one program may have different loggers.
         board = [
@@ -188,7 +188,7 @@ class Tracker:
 
 def _tracked(run: RunDirectory, settings: Config, sweep: str | None) -> TrackedRun:
     path = run.path.absolute()
-    seeds = tuple(range(settings.seed, settings.seed + settings.seeds))
+    seeds = tuple(settings.seed_numbers)
     return TrackedRun(path.name, str(path), seeds, settings.to_dict(), sweep)
 
 

@@ -185,7 +185,7 @@ class Recorder:
         finite = self.processes.gather({"finite": training.finite(state)})["finite"]
         if not self.processes.first:
             return {}
-        numbers = range(training.config.seed, training.config.seed + training.config.seeds)
+        numbers = training.config.seed_numbers
         found = divergence.of_networks(finite, numbers, step)
         return divergence.earliest(divergence.of_run(directory, step), found)
 
@@ -200,8 +200,7 @@ class Recorder:
                     f"{directory.path} is at env step {done:,} of {training.total_steps:,}: to train on, raise "
                     "total_steps="
                 )
-            state = checkpoint.restore(saved, training.trainer, training.share)
-            training.best.restore(saved, training.share)
+            state = checkpoint.restore(saved, training.trainer, training.share, best=training.best)
             watch = self._watch(training, self._diverged(training, directory, state, done))
             if self.processes.first:
                 self.say(f"{directory.path} has come to its end; its figures and its summary are made")
@@ -214,9 +213,8 @@ class Recorder:
                 self.say(line)
             self.say(f"resumed from the checkpoint of env step {done:,}")
             for line in host_states.notes(saved, training.trainer, unpickle):
-                (self.say if self.shows_progress else warn)(line)
-        state = checkpoint.restore(saved, training.trainer, training.share, unpickle)
-        training.best.restore(saved, training.share)
+                self._tell(line)
+        state = checkpoint.restore(saved, training.trainer, training.share, unpickle, training.best)
         self.processes.barrier()  # the files are changed only when all have what they need
         if self.processes.first:
             checkpoint.set_aside_after(directory.checkpoints, done)
@@ -308,7 +306,7 @@ class Recorder:
         diverged, with_q_bias = self._by_number(training, watch), training.config.diagnostics.q_bias
         title = announcement.title(training)
         last = directory.checkpoints / str(checkpoint.steps(directory.checkpoints)[-1])
-        numbers = range(training.config.seed, training.config.seed + training.config.seeds)
+        numbers = training.config.seed_numbers
         facts = {**facts, **best.summary(last, numbers)}
         found = finish.finish(directory, training.layout, title, with_q_bias, done, facts, diverged)
         for line in announcement.last_lines(training, directory, found, diverged):

@@ -56,7 +56,7 @@ def load(run: RunDirectory, training: TrainingSession, which: int | str | None) 
     if which == BEST:
         state, found = best.played(path, state, seeds)
         steps, evaluations = np.array([0 if one is None else one.step for one in found]), tuple(found)
-    numbers = range(training.config.seed, training.config.seed + seeds)
+    numbers = training.config.seed_numbers
     finite = training.finite(state)
     by_seed = dict(zip(numbers, steps.tolist(), strict=True))
     networks = {

@@ -223,8 +223,7 @@ class TrainingSession:
 
     def expected_table(self, config: Config) -> Expected:
         """What the metrics table of a member should have."""
-        seeds = range(config.seed, config.seed + config.seeds)
-        return Expected(self.columns, seeds, self.trainer.schedule.warmup_steps, self.interval_steps)
+        return Expected(self.columns, config.seed_numbers, self.trainer.schedule.warmup_steps, self.interval_steps)
 
     def team_weights(self, team: str) -> np.ndarray:
         """Weights [agents] of the agents' returns in the number reported for a team (`Environment.return_weights`)."""

@@ -114,7 +114,7 @@ def of(settings: Config, training: TrainingSession) -> "Leaves":
     Args:
         training: of settings with the same programs.
     """
-    seeds = range(settings.seed, settings.seed + settings.seeds)
+    seeds = settings.seed_numbers
     layout, template = training.layout, training.trainer.abstract_state()
     init = None
     if settings.init is not None:

@@ -18,7 +18,7 @@ from matd3_jax.envs.host import pickling
 from matd3_jax.envs.host.call import bits, call, floats
 from matd3_jax.envs.host.pool import TERMINATED, TRUNCATED, Pool, Simulation, quiet
 from matd3_jax.envs.spaces import Box
-from matd3_jax.errors import OptionError
+from matd3_jax.errors import OptionError, described, one_line
 
 RUNNING = 0
 """`HostState.end` of an episode that has not ended."""
@@ -173,8 +173,9 @@ class HostEnvironment(Environment):
         try:
             pickling.Pickler(stream).dump(self.pool.dump(numbers))
         except Exception as error:
-            words = " ".join(str(error).split())
-            raise OptionError(f"env.pickle=true: {self.name} cannot be pickled ({words}); leave it false") from error
+            raise OptionError(
+                f"env.pickle=true: {self.name} cannot be pickled ({one_line(error)}); leave it false"
+            ) from error
         return stream.getvalue()
 
     def load(self, dumped: bytes) -> np.ndarray:
@@ -205,8 +206,7 @@ def asking(name: str) -> Iterator[None]:
     except OptionError:
         raise
     except Exception as error:
-        words = " ".join(str(error).split())
-        raise OptionError(f"{name} cannot be played: {type(error).__name__}: {words}") from error
+        raise OptionError(f"{name} cannot be played: {described(error)}") from error
 
 
 def cores() -> int:

@@ -1,18 +1,16 @@
 """Environments with PettingZoo's parallel API."""
 
-import abc
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
 from typing import Any
 
 import chex
 import jax.numpy as jnp
 import numpy as np
 
-from matd3_jax.envs.environment import check_count
 from matd3_jax.envs.host import sources
-from matd3_jax.envs.host.environment import HostEnvironment, HostState, asking
+from matd3_jax.envs.host.environment import HostState
+from matd3_jax.envs.host.made import MadeEnvironment
 from matd3_jax.envs.host.parallel_simulation import Facts, ParallelSimulation, ask
 from matd3_jax.envs.host.pool import quiet
 from matd3_jax.envs.spaces import ActionSpace
@@ -21,7 +19,7 @@ from matd3_jax.errors import OptionError, nearest
 EXAMPLE = "a module with a parallel_env, or module:function, for instance env.id=mpe2.simple_spread_v3"
 
 
-class _Parallel(HostEnvironment):
+class _Parallel(MadeEnvironment[Facts]):
     """What the environments with PettingZoo's parallel API share; see `PettingZoo`."""
 
     adversaries: tuple[str, ...] | None
@@ -29,8 +27,7 @@ class _Parallel(HostEnvironment):
 
     def _settle(self) -> None:
         """Check the options, and ask the environment what it is."""
-        if self.episode_length is not None:
-            check_count("episode_length", self.episode_length, 1)
+        self._check_length()
         name = self.name
         facts = self.facts
         if self.adversaries is not None:
@@ -40,38 +37,20 @@ class _Parallel(HostEnvironment):
             for agent in self.adversaries:
                 if agent not in facts.agents:
                     raise OptionError(f"adversaries: {name} has no agent {agent!r}; {nearest(agent, facts.agents)}")
-        if self.episode_length is None:
-            if facts.limit is None:
-                raise OptionError(
-                    f"{name} does not say after how many env steps it truncates: give env.episode_length="
-                )
-            object.__setattr__(self, "episode_length", facts.limit)
+        self._take_length("does not say after how many env steps it truncates")
         self.begin()
 
-    @abc.abstractmethod
-    def _source(self) -> tuple[Callable[[], Any], Any]:
-        """(a function that makes copies, the first copy)"""
+    def _wrong(self, found: Any) -> str | None:
+        if is_parallel(found):
+            return None
+        hint = ": convert it with pettingzoo.utils.aec_to_parallel" if hasattr(found, "agent_iter") else ""
+        return f"has no parallel API{hint}"
 
-    @cached_property
-    def _made(self) -> tuple[Callable[[], Any], Facts, list[Any]]:
-        """(what makes copies, what they are, the first copy until it is used)"""
-        make, first = self._source()
-        if not is_parallel(first):
-            hint = ": convert it with pettingzoo.utils.aec_to_parallel" if hasattr(first, "agent_iter") else ""
-            raise OptionError(f"{self.name} gives a {type(first).__name__}, which has no parallel API{hint}")
-        with asking(self.name):
-            return make, ask(first, self.name), [first]
+    def _ask(self, found: Any) -> Facts:
+        return ask(found, self.name)
 
-    @property
-    def facts(self) -> Facts:
-        return self._made[1]
-
-    def simulation(self) -> ParallelSimulation:
-        make, facts, first = self._made
-        try:
-            return ParallelSimulation(first.pop(), facts)
-        except IndexError:
-            return ParallelSimulation(make(), facts)
+    def _simulation(self, found: Any) -> ParallelSimulation:
+        return ParallelSimulation(found, self.facts)
 
     # ---- the contract ------------------------------------------------------------------------------------------------
 
@@ -168,10 +147,7 @@ class PettingZoo(_Parallel):
             with quiet():
                 return make, make()
         except Exception as error:
-            words = " ".join(str(error).split())
-            raise OptionError(
-                f"env.id={self.id} cannot be made with env.kwargs={self.kwargs!r}: {type(error).__name__}: {words}"
-            ) from error
+            raise OptionError(sources.unmade(self.id, self.kwargs, error)) from error
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -190,7 +166,7 @@ class PettingZooObject(_Parallel):
 
     @property
     def name(self) -> str:
-        return getattr(self.source, "__qualname__", type(self.source).__name__)
+        return sources.called(self.source)
 
     def _source(self) -> tuple[Callable[[], Any], Any]:
         return sources.maker(self.source, is_parallel)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from matd3_jax.errors import HostError
+from matd3_jax.errors import HostError, described
 
 TERMINATED, TRUNCATED = 1, 2
 """Bits of how an episode ended."""
@@ -22,7 +22,7 @@ REMEMBERED = 256
 
 
 class Outcome(NamedTuple):
-    """What a step came to, besides what is seen then."""
+    """The result of a step, besides what is seen then."""
 
     reward: np.ndarray
     """[num_agents]"""
@@ -69,8 +69,8 @@ class Pool:
 
     A state is only a reference, so it goes forward alone: the copy is where the last step left it. Two exceptions make
     calls from a compiled program safe. A state at the beginning of an episode can be stepped any number of times, as
-    its seed makes it anew: a program may have one reset for several episodes with the same key. And what was asked last
-    of a copy is answered again without a step.
+    its seed makes it again: a program may have one reset for several episodes with the same key. And what was asked
+    last of a copy is answered again without a step.
 
     Questions and answers are rows of int32, real numbers in them as their float32 bits. All methods can be called from
     several threads.
@@ -227,8 +227,7 @@ class Pool:
             with quiet():
                 return function(*arguments)
         except Exception as error:
-            words = " ".join(str(error).split())
-            raise HostError(f"{self._name}: {what} raised {type(error).__name__}: {words}") from error
+            raise HostError(f"{self._name}: {what} raised {described(error)}") from error
 
     def _each(self, function: Callable[[Any], Any], items: Sequence[Any] | np.ndarray) -> list[Any]:
         """`function` of all items, which the threads share."""

@@ -1,6 +1,5 @@
 """gymnasium's environments, their actions shared out among agents."""
 
-import abc
 import dataclasses
 from collections.abc import Callable, Mapping
 from functools import cached_property
@@ -9,17 +8,18 @@ from typing import Any
 import chex
 import numpy as np
 
-from matd3_jax.envs.environment import check_choice, check_count
+from matd3_jax.envs.environment import check_choice
 from matd3_jax.envs.host import sharing, sources
-from matd3_jax.envs.host.environment import HostEnvironment, HostState, asking, cores
+from matd3_jax.envs.host.environment import HostState, cores
+from matd3_jax.envs.host.made import MadeEnvironment
 from matd3_jax.envs.host.pool import quiet
 from matd3_jax.envs.host.sharing import Shares
 from matd3_jax.envs.host.single_simulation import Facts, SingleSimulation, ask
 from matd3_jax.envs.spaces import ActionSpace, Box
-from matd3_jax.errors import OptionError, nearest
+from matd3_jax.errors import OptionError, nearest, one_line
 
 
-class _Single(HostEnvironment):
+class _Single(MadeEnvironment[Facts]):
     """What gymnasium's environments share; see `Gymnasium`."""
 
     split: Shares
@@ -28,41 +28,22 @@ class _Single(HostEnvironment):
     def _settle(self) -> None:
         """Check the options, and ask the environment what it is."""
         object.__setattr__(self, "split", sharing.as_split(self.split))
-        if self.episode_length is not None:
-            check_count("episode_length", self.episode_length, 1)
+        self._check_length()
         facts = self.facts
-        if self.episode_length is None:
-            if facts.limit is None:
-                raise OptionError(f"{self.name} has no time limit of its own: give env.episode_length=")
-            object.__setattr__(self, "episode_length", facts.limit)
+        self._take_length("has no time limit of its own")
         if self.split != "single" and not isinstance(facts.action.ours, Box):
             raise OptionError(f"split={self.split!r}: {self.name} takes {facts.action.ours}; only a Box can be shared")
         self.shares, self.observed  # noqa: B018  # raise for what is impossible
         self.begin()
 
-    @abc.abstractmethod
-    def _source(self) -> tuple[Callable[[], Any], Any]:
-        """(a function that makes copies, the first copy)"""
+    def _wrong(self, found: Any) -> str | None:
+        return None if is_gymnasium(found) else "is no gymnasium environment"
 
-    @cached_property
-    def _made(self) -> tuple[Callable[[], Any], Facts, list[Any]]:
-        """(what makes copies, what they are, the first copy until it is used)"""
-        make, first = self._source()
-        if not is_gymnasium(first):
-            raise OptionError(f"{self.name} gives a {type(first).__name__}, which is no gymnasium environment")
-        with asking(self.name):
-            return make, ask(first, self.name), [first]
+    def _ask(self, found: Any) -> Facts:
+        return ask(found, self.name)
 
-    @property
-    def facts(self) -> Facts:
-        return self._made[1]
-
-    def simulation(self) -> SingleSimulation:
-        make, facts, first = self._made
-        try:
-            return SingleSimulation(first.pop(), facts)
-        except IndexError:
-            return SingleSimulation(make(), facts)
+    def _simulation(self, found: Any) -> SingleSimulation:
+        return SingleSimulation(found, self.facts)
 
     @property
     def threads(self) -> int:
@@ -213,14 +194,13 @@ class Gymnasium(_Single):
     def _unmade(self, error: Exception) -> str:
         import gymnasium
 
-        words = " ".join(str(error).split())
         if isinstance(error, gymnasium.error.UnregisteredEnv | gymnasium.error.NamespaceNotFound):
             hint = nearest(self.id, gymnasium.registry) if ":" not in str(self.id) else "see its package"
             hint = hint if len(hint) < 200 else "gymnasium.pprint_registry() lists them"
             return f"env.id={self.id}: gymnasium has no such environment; {hint}"
         if isinstance(error, ImportError):
-            return f"env.id={self.id}: a package is missing ({words})"
-        return f"env.id={self.id} cannot be made with env.kwargs={self.kwargs!r}: {type(error).__name__}: {words}"
+            return f"env.id={self.id}: a package is missing ({one_line(error)})"
+        return sources.unmade(self.id, self.kwargs, error)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -239,7 +219,7 @@ class GymnasiumObject(_Single):
 
     @property
     def name(self) -> str:
-        return getattr(self.source, "__qualname__", type(self.source).__name__)
+        return sources.called(self.source)
 
     def _source(self) -> tuple[Callable[[], Any], Any]:
         return sources.maker(self.source, is_gymnasium)

@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from matd3_jax.errors import OptionError
+from matd3_jax.errors import OptionError, described, one_line
 
 
 class Kwargs(Mapping):
@@ -81,7 +81,7 @@ def _module(key: str, name: str, path: str, example: str) -> Any:
             f"{key}={name}: there is no module {error.name}; {_install(error)}, or name {example}"
         ) from error
     except (ImportError, ValueError, TypeError) as error:
-        raise OptionError(f"{key}={name}: cannot be imported ({' '.join(str(error).split())})") from error
+        raise OptionError(f"{key}={name}: cannot be imported ({one_line(error)})") from error
 
 
 def _install(error: ModuleNotFoundError) -> str:
@@ -95,6 +95,16 @@ def without_greetings() -> Iterator[None]:
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
         yield
+
+
+def unmade(id: Any, kwargs: Mapping[str, Any], error: Exception) -> str:
+    """What is said of an environment whose function raised an error."""
+    return f"env.id={id} cannot be made with env.kwargs={kwargs!r}: {described(error)}"
+
+
+def called(source: Any) -> str:
+    """What errors call a function that makes environments, or an instance."""
+    return getattr(source, "__qualname__", type(source).__name__)
 
 
 def maker(source: Any, is_environment: Callable[[Any], bool]) -> tuple[Callable[[], Any], Any]:
@@ -116,7 +126,7 @@ def _copies(instance: Any) -> Callable[[], Any]:
         pristine.append(copy.deepcopy(instance))
     except Exception as error:
         raise OptionError(
-            f"{type(instance).__name__} cannot be copied ({' '.join(str(error).split())}), and every seed needs copies "
+            f"{type(instance).__name__} cannot be copied ({one_line(error)}), and every seed needs copies "
             "of its own: give a function that makes it"
         ) from error
     return lambda: copy.deepcopy(pristine[0])
