@@ -107,7 +107,11 @@ def draw(found: Sequence[tuple[str, str, Claim, bool]], path: Path) -> None:
     handles = [Line2D([], [], marker="o", color=color, label=word) for word, color in VERDICTS.items()]
     handles.append(Line2D([], [], color="black", alpha=0.15, linewidth=7, label='margin of "no difference"'))
     if any(small for *_, small in there):
-        handles.append(Line2D([], [], marker="o", color="black", markerfacecolor="white", label="small runs"))
+        handles.append(
+            Line2D(
+                [], [], marker="o", color="black", markerfacecolor="white", label="small runs (robots: half-cheetah)"
+            )
+        )
     missing = len(found) - len(there)
     title = f"not yet run: {missing} more" if missing else None
     figure.legend(
