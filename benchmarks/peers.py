@@ -67,7 +67,7 @@ def main(argv: Sequence[str]) -> int:
     if options.prepare:
         return prepare(folder, options.only)
     devices.prepare()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = devices.cores()
     report: dict[str, Any] = {
         "machine": devices.description(),
         "versions": devices.versions(),

@@ -21,7 +21,7 @@ from experiments.study import RESULTS
 from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option, others
 from matd3_jax.runs.paths import check_directory
-from matd3_jax.runtime import signals
+from matd3_jax.runtime import devices, signals
 from matd3_jax.runtime.terminal import say
 
 PARTS: dict[str, tuple[str, ...]] = {
@@ -135,13 +135,12 @@ def _results(name: str, options: ParallelOptions) -> Path:
 
 def _environment(processes: int) -> dict[str, str]:
     """Of a process that shares the machine. What the user has set stands."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     shared = {
         "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
         "XLA_PYTHON_CLIENT_MEM_FRACTION": f"{0.9 / processes:.3f}",
         # TF32 products, an accelerator's default, change an update by a tenth of its length (docs/performance.md).
         "JAX_DEFAULT_MATMUL_PRECISION": "highest",
-        "JAX_NUM_CPU_DEVICES": str(max(1, cores // processes)),
+        "JAX_NUM_CPU_DEVICES": str(max(1, devices.cores() // processes)),
         "PYTHONUNBUFFERED": "1",
     }
     return {**shared, **os.environ}

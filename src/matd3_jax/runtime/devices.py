@@ -39,9 +39,7 @@ def prepare() -> None:
     if "JAX_NUM_CPU_DEVICES" in os.environ or "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
         return
     try:
-        jax.config.update(
-            "jax_num_cpu_devices", len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        )
+        jax.config.update("jax_num_cpu_devices", cores())
     except RuntimeError:
         pass
 
@@ -86,10 +84,15 @@ def description() -> dict[str, object]:
     return {
         "devices": [f"{d.platform}:{d.id} {d.device_kind}" for d in devices],
         "processor": processor(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": cores(),
         "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),
         "system": platform.platform(),
     }
+
+
+def cores() -> int:
+    """How many threads of this process can run at a time."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def processor() -> str:
