@@ -69,7 +69,6 @@ def test_programs_are_split_by_shapes_and_by_what_their_interval_does():
         "wandb": config.WandbConfig("project", None, "offline"),
         "mlflow": config.MlflowConfig(None, "experiment"),
         "video_every": 5,
-        "on_divergence": "stop",
     }
     assert set(alike) == set(schema.UNSHARED)
     assert {batching.program(dataclasses.replace(base, **{k: v})) for k, v in alike.items()} == {batching.program(base)}

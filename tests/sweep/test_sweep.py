@@ -152,6 +152,20 @@ def test_diverged_seeds_are_counted_and_come_last(swept, tmp_path):
     assert ranked[-1].interval("final")[0] == ranked[-1].final[0]  # of the seed that did not
 
 
+@pytest.mark.slow
+def test_seeds_of_one_member_stop_and_the_others_go_on(swept, tmp_path):
+    given = ["algo.lr=0.01,1e30", "algo.tau=0.01", "seeds=2", "on_divergence=stop_seed"]
+    assert sweep.main([*TINY, *given, f"out={tmp_path}", "name=stops"]) == 0
+    lost, sound = (tmp_path / "stops" / "runs" / f"lr_{lr}" for lr in ("1e+30", "0.01"))
+    assert RunDirectory(sound).summary()["diverged"] == {}
+    assert set(RunDirectory(lost).summary()["diverged"]) == {"0", "1"}
+    networks = {name: leaf for name, leaf in leaves(lost).items() if name.startswith(".groups")}
+    assert leaves(lost)[".stopped"].all() and all(np.isfinite(leaf).all() for leaf in networks.values())
+    there = leaves(sound)
+    for name, leaf in leaves(swept / "runs" / "lr_0.01-tau_0.01").items():  # another program, which rounds otherwise
+        np.testing.assert_allclose(there[name], leaf, rtol=1e-3, atol=1e-5, err_msg=name)
+
+
 def test_a_sweep_that_diverged_everywhere_is_reported(swept, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(swept, copy)

@@ -180,7 +180,7 @@ class Config:
     wandb: WandbConfig = setting(BOOKKEEPING)
     mlflow: MlflowConfig = setting(BOOKKEEPING)
     video_every: int = setting(BOOKKEEPING, least=0, before=0)
-    on_divergence: str = setting(BOOKKEEPING, choices=("continue", "stop"), before="continue")
+    on_divergence: str = setting(BOOKKEEPING, splits=True, choices=("continue", "stop_seed", "stop"), before="continue")
 
     def teams(self) -> dict[str, AlgoConfig]:
         """The algorithm of each team."""

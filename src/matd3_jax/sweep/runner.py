@@ -114,8 +114,11 @@ class Sweep:
                 shutil.rmtree(path)
         for config in settings.values():
             outputs.check(config)
-        if any(config.on_divergence != "continue" for config in settings.values()):
-            raise UserError("on_divergence=stop: a sweep's runs are trained side by side, and none ends the others")
+        if any(config.on_divergence == "stop" for config in settings.values()):
+            raise UserError(
+                "on_divergence=stop: a sweep's runs are trained side by side, and none ends the others; "
+                "on_divergence=stop_seed stops the seeds that diverge"
+            )
         budget = devices.free_memory(self.processes.local) if budget is None else budget
         size = self.processes.size
         existing = batching.existing_runs(self.runs)

@@ -17,6 +17,7 @@ from matd3_jax.core.rollout import EnvState, Episodes, PolicyParams
 from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.core.update import UpdateMetrics
 from matd3_jax.envs.environment import Environment
+from matd3_jax.training import stopping
 from matd3_jax.training.program import Program
 from matd3_jax.training.schedule import Schedule
 from matd3_jax.training.sharding import SeedSharding, stack, unstack
@@ -39,6 +40,7 @@ class TrainLoop:
         unroll: how many iterations, and updates after a rollout with many, one pass of their compiled loop holds;
             longer passes are more to compile and fewer launches of an accelerator. The numbers stay the same.
         unroll_steps: the same of the env steps of a rollout.
+        stop_seeds: a seed that diverges learns no more (see `stopping`).
     """
 
     def __init__(
@@ -57,7 +59,9 @@ class TrainLoop:
         unroll_steps: int = 1,
         devices_per_seed: int | None = None,
         earlier_statistics: bool = False,
+        stop_seeds: bool = False,
     ):
+        self.stop_seeds = stop_seeds
         self.earlier_statistics = earlier_statistics and normalize_observations
         self.env, self.layout, self.schedule, self.num_seeds = env, layout, schedule, num_seeds
         self.unroll, self.unroll_steps = unroll, unroll_steps
@@ -151,7 +155,7 @@ class TrainLoop:
     @cached_property
     def _init(self) -> Callable:
         settings = self.env, self.layout, self.schedule.num_envs, self.normalize_observations
-        begin = partial(initial, *settings, self.q_bias_pairs, self.earlier_statistics)
+        begin = partial(initial, *settings, self.q_bias_pairs, self.earlier_statistics, self.stop_seeds)
         return self.sharding.sharded(begin, P("seeds"), self._specs)
 
     @cached_property
@@ -162,7 +166,8 @@ class TrainLoop:
 
     @property
     def _specs(self) -> TrainState:
-        return prefix(P("seeds"), P(), self.normalize_observations, self.q_bias_pairs > 0, self.earlier_statistics)
+        there = self.normalize_observations, self.q_bias_pairs > 0, self.earlier_statistics, self.stop_seeds
+        return prefix(P("seeds"), P(), *there)
 
     def policy(
         self, state: TrainState, hyper: tuple[HyperParams, ...] | None = None, average: bool = False
@@ -246,7 +251,15 @@ class TrainLoop:
             return states, jax.tree.map(lambda *m: jnp.stack(m), *metrics)
 
         def one(args):
-            seed, states, key, hyper = args
+            seed, states, key, hyper, stopped = args
+            if stopped is None or axis is not None:  # a branch that some devices alone take must not talk to others
+                return learned(seed, states, key, hyper)
+            nothing = jax.tree.map(
+                lambda leaf: jnp.full(leaf.shape, jnp.nan), jax.eval_shape(learned, seed, states, key, hyper)[1]
+            )
+            return jax.lax.cond(stopped, lambda: (states, nothing), lambda: learned(seed, states, key, hyper))
+
+        def learned(seed, states, key, hyper):
             keys = jax.random.split(key, schedule.updates_per_collect).reshape(-1, unrolled)
             if keys.shape[0] == 1:
                 states, metrics = period(seed, hyper, states, keys[0])
@@ -257,12 +270,13 @@ class TrainLoop:
         keys = jax.vmap(partial(jax.random.split, num=2))(state.key)
         seeds = jnp.arange(keys.shape[0])
         if isinstance(state.groups, list):
-            rest = unstack((seeds, keys[:, 0], hyper), len(state.groups))
-            found = [one((seed, g, key, own)) for g, (seed, key, own) in zip(state.groups, rest, strict=True)]
+            rest = unstack((seeds, keys[:, 0], hyper, state.stopped), len(state.groups))
+            found = [one((seed, g, *own)) for g, (seed, *own) in zip(state.groups, rest, strict=True)]
             states, metrics = [networks for networks, _ in found], stack([m for _, m in found])
         else:
             together = self.sharding.seeds_together
-            states, metrics = jax.lax.map(one, (seeds, state.groups, keys[:, 0], hyper), batch_size=together)
+            per_seed = seeds, state.groups, keys[:, 0], hyper, state.stopped
+            states, metrics = jax.lax.map(one, per_seed, batch_size=together)
         # The next rollout writes where these updates read. Where the actor is delayed nothing else makes XLA do one
         # after the other, and it would copy the whole replay: so let the count of rollouts, hence the next write's
         # offset, depend on the updates. A mean squared error is never negative; XLA does not know.
@@ -297,8 +311,12 @@ class TrainLoop:
     def iteration(self, state: TrainState, hyper) -> tuple[TrainState, Metrics]:
         episodes, metrics = [], []
         for c in range(self.rollouts_per_iteration):
+            before = state
             state, e = self.rollout(state, hyper)
             state, m = self.learn(state, hyper, first=c * self.schedule.updates_per_collect)
+            if self.stop_seeds:
+                learning = stopping.of_agents(m, self.layout.learners)
+                state = stopping.stop_diverged(before, state, e, learning)
             episodes.append(e)
             metrics.append(m)
         total = jax.tree.map(lambda *e: sum(e), *episodes)

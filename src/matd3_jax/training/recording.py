@@ -189,17 +189,24 @@ class Recorder:
         found = divergence.of_networks(finite, numbers, step)
         return divergence.earliest(divergence.of_run(directory, step), found)
 
+    def _all_stopped(self, training: TrainingSession, directory: RunDirectory, step: int) -> bool:
+        """Whether no seed is left to train at env step `step`."""
+        if training.config.on_divergence != "stop_seed":
+            return False
+        found = len(divergence.of_run(directory, step)) if self.processes.first else None
+        return self.processes.broadcast(found) == training.share.total
+
     def _from_checkpoint(
         self, training: TrainingSession, directory: RunDirectory, saved: Path, stop: Stop | None, unpickle: bool
     ) -> Recorded:
         done = int(saved.name)
         row = {"step": np.array([done])}
-        if done >= training.total_steps:
+        all_stopped = self._all_stopped(training, directory, done)
+        if done >= training.total_steps or all_stopped:
             if self.processes.broadcast(directory.summary() is not None if self.processes.first else None):
-                raise UserError(
-                    f"{directory.path} is at env step {done:,} of {training.total_steps:,}: to train on, raise "
-                    "total_steps="
-                )
+                where = f"{directory.path} is at env step {done:,} of {training.total_steps:,}: "
+                left = "all its seeds have diverged and stopped" if all_stopped else "to train on, raise total_steps="
+                raise UserError(where + left)
             state = checkpoint.restore(saved, training.trainer, training.share, best=training.best)
             watch = self._watch(training, self._diverged(training, directory, state, done))
             if self.processes.first:

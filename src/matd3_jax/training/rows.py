@@ -51,6 +51,12 @@ def of_interval(
     return row
 
 
+def without_learning(row: Row, stopped: np.ndarray) -> Row:
+    """The row with nan for what seeds learn in an interval in which they stopped, or after it; stopped: [seeds]."""
+    learning = tuple(f"_{name}" for name in LEARNING_COLUMNS)
+    return {name: np.where(stopped, np.nan, v) if name.endswith(learning) else v for name, v in row.items()}
+
+
 def columns(layout: JointLayout) -> Sequence[str]:
     """The names of the columns of `of_interval`, in their order."""
     names = ["step", "seed", "updates", "episodes", "episode_length"]

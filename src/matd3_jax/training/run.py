@@ -46,7 +46,7 @@ def run(
     film: Callable[[TrainState, int, int], object] | None = None,
 ) -> Outcome:
     """Train interval after interval to the end, or until a signal comes, or with `on_divergence=stop` until a seed
-    diverges; the loggers are closed then.
+    diverges, with `stop_seed` until all have; the loggers are closed then.
 
     Args:
         state, row: where the run stands; the state is donated.
@@ -81,17 +81,17 @@ def run(
 
     watch = next((logger for logger in loggers if isinstance(logger, DivergenceLogger)), None)
 
-    def halted() -> bool:
-        if training.config.on_divergence != "stop":
+    def agreed(mode: str, there: Callable[[DivergenceLogger], bool]) -> bool:
+        if training.config.on_divergence != mode:
             return False
-        return bool(training.processes.agree(int(watch is not None and watch.new > 0)))
+        return bool(training.processes.agree(int(watch is not None and there(watch))))
 
-    halt = False
+    halt = ended_early = False
     try:
         if save is not None and save_first and (every or minutes):
             write(state)
         signal = stopped()
-        while step < training.total_steps and signal is None and not halt:
+        while step < training.total_steps and signal is None and not halt and not ended_early:
             state, row = training.advance(state)
             before, step = step, int(row["step"][0])
             for logger in loggers:
@@ -100,10 +100,11 @@ def run(
                 film(state, before, step)
             if due():
                 write(state)
-            signal, halt = stopped(), halted()
+            signal, halt = stopped(), agreed("stop", lambda watch: watch.new > 0)
+            ended_early = agreed("stop_seed", lambda watch: watch.everywhere)  # nobody is left who learns
     finally:
         for logger in loggers:
             logger.close()
     diverged = {} if watch is None else watch.diverged
-    left = step < training.total_steps
+    left = step < training.total_steps and not ended_early
     return Outcome(state, row, signal if left else None, diverged, left and halt and signal is None)

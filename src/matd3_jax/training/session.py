@@ -98,6 +98,7 @@ class TrainingSession:
         least = config.normalize_least_deviation
         options: dict[str, Any] = {"normalize_observations": normalize, "least_deviation": least}
         options["earlier_statistics"] = config.init is not None
+        options["stop_seeds"] = config.on_divergence == "stop_seed"
         trainer = TrainLoop(self.env, self.layout, schedule, hyper, seeds, local, **options)
         # Whole intervals of equal length, so that one compiled program does for all; as many as come closest to
         # log_every.
@@ -212,7 +213,10 @@ class TrainingSession:
     def row(self, state: TrainState, metrics: Metrics) -> Row:
         """The interval's row of the metrics table for each seed."""
         step, updates = self.step(state), self.trainer.updates(int(state.rollouts))
-        return rows.of_interval(self.layout, self.seeds, step, updates, metrics, self.team_weights)
+        row = rows.of_interval(self.layout, self.seeds, step, updates, metrics, self.team_weights)
+        if state.stopped is None:
+            return row
+        return rows.without_learning(row, np.asarray(state.stopped)[: len(self.seeds)])
 
     @property
     def columns(self) -> list[str]:

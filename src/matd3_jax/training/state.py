@@ -31,6 +31,8 @@ class TrainState(NamedTuple):
     """What the critics are judged on (see `q_bias`); None where they are not. `since` has no axis [seeds]."""
     earlier: chex.Array | None = None
     """[seeds] how many rollouts the statistics were made of when the run began; None where it began without any."""
+    stopped: chex.Array | None = None
+    """[seeds] whether a seed has diverged and learns no more; None where such seeds continue (see `stopping`)."""
 
 
 class Metrics(NamedTuple):
@@ -42,11 +44,14 @@ class Metrics(NamedTuple):
     """Means over the updates of the iteration (actor_loss over those that moved the actor)."""
 
 
-def prefix(seeds: Any, everywhere: Any, normalize: bool, reservoir: bool, earlier: bool = False) -> TrainState:
+def prefix(
+    seeds: Any, everywhere: Any, normalize: bool, reservoir: bool, earlier: bool = False, stops: bool = False
+) -> TrainState:
     """Make a prefix tree of the state: `seeds` for leaves with the axis [seeds], `everywhere` for those without."""
     statistics = seeds if normalize else None
     kept = Reservoir(seeds, everywhere) if reservoir else None
-    return TrainState(seeds, seeds, seeds, seeds, everywhere, statistics, kept, seeds if earlier else None)
+    rollouts, stopped = (seeds if there else None for there in (earlier, stops))
+    return TrainState(seeds, seeds, seeds, seeds, everywhere, statistics, kept, rollouts, stopped)
 
 
 def initial(
@@ -56,6 +61,7 @@ def initial(
     normalize: bool,
     q_bias_pairs: int,
     earlier: bool,
+    stops: bool,
     keys: chex.PRNGKey,
 ) -> TrainState:
     """Begin the runs of `keys` [seeds], with an empty replay.
@@ -64,6 +70,7 @@ def initial(
         normalize: with running statistics of the observations.
         q_bias_pairs: states and actions that the reservoir has room for; 0: there is none.
         earlier: with a place for how many rollouts given statistics were made of.
+        stops: with a place for which seeds have stopped.
     """
 
     def one(key):
@@ -77,6 +84,8 @@ def initial(
         state = state._replace(reservoir=Reservoir(pairs, jnp.int32(0)))
     if earlier:
         state = state._replace(earlier=jnp.zeros(keys.shape[0]))
+    if stops:
+        state = state._replace(stopped=jnp.zeros(keys.shape[0], bool))
     if not normalize:
         return state
     fresh = running_statistics.initial(layout.observation_size)
