@@ -201,7 +201,7 @@ def _gathers(trainer: TrainLoop, state: TrainState, hyper: Any) -> tuple[TrainSt
 
         def gather(key):
             indices = replay.sample_indices(key, size, (batches, schedule.batch_size))
-            return trainer.minibatches(state, hyper, seed, indices).sum()
+            return trainer.learner.minibatches(state, hyper, seed, indices).sum()
 
         return jax.lax.map(gather, keys)
 
@@ -212,7 +212,7 @@ def _gathers(trainer: TrainLoop, state: TrainState, hyper: Any) -> tuple[TrainSt
 def _updates(trainer: TrainLoop, state: TrainState, hyper: Any) -> tuple[TrainState, Any]:
     metrics = None
     for c in range(trainer.rollouts_per_iteration):
-        state, metrics = trainer.learn(state, hyper, first=c * trainer.schedule.updates_per_collect)
+        state, metrics = trainer.learner.learn(state, hyper, first=c * trainer.schedule.updates_per_collect)
     return state, metrics
 
 

@@ -117,19 +117,19 @@ def test_a_floor_keeps_small_what_hardly_ever_moves():
     np.testing.assert_allclose(got, [[1, 1, 0.2]], atol=1e-5)
     assert running_statistics.normalize(statistics, x)[0, 2] > 9
     t, state, _, _ = run()
-    t.least_deviation = 0.4
+    t.learner.least_deviation = 0.4
     try:
         for seed in range(SEEDS):
             kept, read = of_seed(state.statistics, seed), of_seed(t.policy(state).statistics, seed)
             np.testing.assert_allclose(read.variance, np.maximum(kept.variance, 0.16), rtol=1e-6)
             np.testing.assert_array_equal(read.mean, kept.mean)
             assert (kept.variance < 0.16).any() and (kept.variance > 0.16).any()
-            rows = np.asarray(t.minibatches(state, [HYPER], seed, jnp.arange(5)))
+            rows = np.asarray(t.learner.minibatches(state, [HYPER], seed, jnp.arange(5)))
             raw = np.asarray(state.replay[seed, :5])
             want = (raw[:, :12] - kept.mean) / np.sqrt(np.maximum(kept.variance, 0.16))
             np.testing.assert_allclose(rows[:, :12], np.clip(want, -10, 10), rtol=1e-4, atol=1e-5)
     finally:
-        t.least_deviation = 0.0
+        t.learner.least_deviation = 0.0
 
 
 # ---- where networks read ---------------------------------------------------------------------------------------------
@@ -190,8 +190,8 @@ def test_updates_read_normalized_observations(n_step):
     columns = np.zeros(t.layout.row_size, bool)
     columns[:12] = columns[next_x] = True
     for seed in range(SEEDS):
-        got = np.asarray(jax.jit(t.minibatches)(state, [HYPER], seed, indices))
-        raw = np.asarray(plain.minibatches(state._replace(statistics=None), [HYPER], seed, indices))
+        got = np.asarray(jax.jit(t.learner.minibatches)(state, [HYPER], seed, indices))
+        raw = np.asarray(plain.learner.minibatches(state._replace(statistics=None), [HYPER], seed, indices))
         np.testing.assert_array_equal(got[..., ~columns], raw[..., ~columns])
         statistics = of_seed(in_numpy(state).statistics, seed)
         for part in (slice(0, 12), next_x):

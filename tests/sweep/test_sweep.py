@@ -18,7 +18,8 @@ from matd3_jax.figures import sweep as figure
 from matd3_jax.figures.sweep import BEST
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.sweep import launcher, ranking, runner
-from matd3_jax.sweep.runner import Batch, Sweep
+from matd3_jax.sweep.batch import Batch
+from matd3_jax.sweep.runner import Sweep
 from matd3_jax.training import checkpoint
 from matd3_jax.training.session import TrainingSession
 

@@ -203,9 +203,10 @@ def moves(monkeypatch, delays, updates):
         rows = jnp.zeros((length * env_state.episode_step.shape[0], layout.row_size))
         return env_state, rows, rollout.Episodes(jnp.int32(0), jnp.zeros(layout.num_agents), jnp.int32(0)), None
 
+    begin = back(main_run()[1][0], slice(0, 1))  # before anything is replaced: what it gives is kept for other tests
     monkeypatch.setattr(rollout, "collect", stay)
     trainer = make([0], dataclasses.replace(SCHEDULE, updates_per_collect=updates), delays)
-    bits, _, _ = stubbed_run(monkeypatch, trainer, back(main_run()[1][0], slice(0, 1)), iterations=2)
+    bits, _, _ = stubbed_run(monkeypatch, trainer, begin, iterations=2)
     total = 2 * trainer.rollouts_per_iteration * updates
     assert total % np.lcm(*delays) == 0
     return bits, ["".join("1" if u % d == 0 else "0" for u in range(1, total + 1)) for d in delays]

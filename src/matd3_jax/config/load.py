@@ -1,4 +1,4 @@
-"""Reading settings: YAML files and overrides in Hydra's grammar into a checked `Config`, and back into YAML."""
+"""Reading settings: the files of settings and overrides in Hydra's grammar into a checked `Config`."""
 
 import copy
 import dataclasses
@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
 from hydra import compose, initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, OverrideType, ValueType
@@ -15,31 +14,15 @@ from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from matd3_jax.config.coerce import plain, typed
-from matd3_jax.config.schema import (
-    ADDED_LATER,
-    LOGGERS,
-    OF_FROZEN,
-    RENAMED,
-    TEXTS,
-    AlgoConfig,
-    Config,
-    DiagnosticsConfig,
-    MlflowConfig,
-    WandbConfig,
-)
-from matd3_jax.config.validate import check
-from matd3_jax.errors import OptionError, UserError, nearest, one_line
+from matd3_jax.config.coerce import plain
+from matd3_jax.config.file import omegaconf_error, read
+from matd3_jax.config.plain_values import from_dict
+from matd3_jax.config.schema import OF_FROZEN, RENAMED, TEXTS, Config
+from matd3_jax.errors import OptionError, UserError, nearest
 from matd3_jax.groups import GROUPS, known_names
-from matd3_jax.runtime import files
 
 FREE = ("env", "kwargs")
 """A group of settings whose keys are not ours."""
-
-DEEPEST, LARGEST_FILE = 20, 10**6
-"""Groups within each other, and characters, of a file of settings that is read."""
-
-_MALFORMED = (yaml.YAMLError, OmegaConfBaseException)
 
 ROBOT_RECIPE = "fast"
 """What robots train by unless a recipe is given, on every machine."""
@@ -92,7 +75,7 @@ def load(overrides: Sequence[str] = (), known: Sequence[str] = ()) -> Config:
             _update(tree, override)
         resolved = OmegaConf.to_container(tree, resolve=True, throw_on_missing=True)
     except (HydraException, OmegaConfBaseException) as error:
-        raise UserError(_one_line(error)) from error
+        raise UserError(omegaconf_error(error)) from error
     assert isinstance(resolved, dict)
     resolved["env"] = _with_engine(resolved["env"])
     for key in ("robot", "per_algorithm"):  # what only serves the files
@@ -168,104 +151,6 @@ def _files(lines: tuple[str, ...]) -> DictConfig:
         return compose("config", list(lines))
 
 
-def read(path: Path) -> Config:
-    """The configuration that `write` left. Raises UserError if it cannot be read."""
-    try:
-        written = path.read_text(encoding="utf-8")
-        _check_plain(written)
-        found = OmegaConf.to_container(OmegaConf.create(written)) if written.strip() else None
-        if not isinstance(found, dict):
-            raise UserError("it has no settings")
-        values = _with_defaults(with_logger_list(renamed(found)), ADDED_LATER)
-        if "physics" in _environment(values):
-            from matd3_jax.envs.robots.engines.engine import RENAMED
-
-            physics = values["env"]["physics"]
-            values["env"] = {**values["env"], "physics": RENAMED.get(physics, physics)}
-        return from_dict(values)
-    except (OSError, ValueError, TypeError, AttributeError, AssertionError, *_MALFORMED) as error:
-        raise UserError(f"cannot read the configuration {path}: {_one_line(error)}") from error
-
-
-def _check_plain(text: str) -> None:
-    """Raise UserError where YAML is not of the kind that `write` leaves: values that refer to each other may stand for
-    any number, and deep ones for more calls than there may be."""
-    depth = 0
-    if len(text) > LARGEST_FILE:
-        raise UserError(f"it has more than {LARGEST_FILE:,} characters")
-    for event in yaml.parse(text):
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if isinstance(event, yaml.AliasEvent):
-            raise UserError(f"*{event.anchor} refers to another value, which settings do not")
-        if depth > DEEPEST:
-            raise UserError(f"it has more than {DEEPEST} groups inside each other")
-
-
-def renamed(values: Mapping[Any, Any]) -> dict[Any, Any]:
-    """Plain settings with the names that keys have now, in their groups, too."""
-    return {
-        RENAMED.get(key, key): renamed(value) if isinstance(value, Mapping) else value for key, value in values.items()
-    }
-
-
-def with_logger_list(values: Mapping[Any, Any]) -> dict[Any, Any]:
-    """Plain settings with the list `logger` where older ones have `tensorboard: true` or false."""
-    found = dict(values)
-    if "tensorboard" in found:
-        wanted = found.pop("tensorboard")
-        found.setdefault("logger", ["csv", "tensorboard"] if wanted else ["csv"])
-    return found
-
-
-def text(config: Config) -> str:
-    """Every resolved value, as YAML."""
-    return OmegaConf.to_yaml(OmegaConf.create(config.to_dict()))
-
-
-def write(config: Config, path: Path) -> None:
-    """Leave every resolved value in a YAML file."""
-    files.write_text(path, text(config))
-
-
-def from_dict(values: Mapping[str, Any]) -> Config:
-    """A checked configuration from plain values. Raises UserError."""
-    rest = dict(values)
-    env = _environment(rest)
-    algo = typed(AlgoConfig, _algorithm(rest, "algo"), "algo.")
-    adversary = None
-    if rest.get("adversary") is not None:
-        adversary = typed(AlgoConfig, _algorithm(rest, "adversary"), "adversary.")
-    diagnostics = typed(DiagnosticsConfig, _group(rest, "diagnostics", "diagnostics.q_bias=true"), "diagnostics.")
-    wandb = typed(WandbConfig, _group(rest, "wandb", "wandb.project=mine"), "wandb.")
-    mlflow = typed(MlflowConfig, _group(rest, "mlflow", "mlflow.experiment=mine"), "mlflow.")
-    groups = {"env": env, "algo": algo, "adversary": adversary, "diagnostics": diagnostics}
-    config = typed(Config, {**rest, **groups, "wandb": wandb, "mlflow": mlflow}, "")
-    check(config)
-    in_effect = tuple(name for name in LOGGERS if name == "csv" or name in config.logger)
-    return dataclasses.replace(config, logger=in_effect)
-
-
-def _group(values: Mapping[str, Any], key: str, example: str) -> Mapping[str, Any]:
-    """A group of settings. Raises UserError where it is missing, or no group."""
-    if key not in values:
-        raise UserError(f"the key {key!r} is missing")
-    found = values[key]
-    if not isinstance(found, Mapping):
-        raise UserError(f"{key}={found!r}: must be a group of keys, for instance {example}")
-    return found
-
-
-def _algorithm(values: Mapping[str, Any], key: str) -> dict[str, Any]:
-    return {name: value for name, value in _group(values, key, f"{key}.gamma=0.95").items() if name != "lr"}
-
-
-def _environment(values: Mapping[str, Any]) -> Mapping[str, Any]:
-    env = _group(values, "env", "env.name=simple_spread")
-    if not isinstance(env.get("name"), str):
-        raise UserError(f"env.name={env.get('name')!r}: must be the name of an environment")
-    return env
-
-
 def _with_engine(env: Mapping[str, Any]) -> Mapping[str, Any]:
     """A robot's options with the engine that this machine takes for `physics: auto`: a run keeps it wherever it is
     resumed."""
@@ -277,15 +162,6 @@ def _with_engine(env: Mapping[str, Any]) -> Mapping[str, Any]:
         return {**env, "physics": engine.resolve(env["physics"])}
     except OptionError as error:
         raise UserError(f"env.{error}") from error
-
-
-def _with_defaults(found: Mapping[Any, Any], defaults: Mapping[str, Any]) -> dict[Any, Any]:
-    """`found` with the keys that it lacks, also within its groups."""
-    values = {**defaults, **found}
-    for key, default in defaults.items():
-        if isinstance(default, Mapping) and isinstance(values[key], Mapping):
-            values[key] = {**default, **values[key]}
-    return values
 
 
 def _check_keys(tree: DictConfig, values: Sequence[Override], known: Sequence[str]) -> None:
@@ -343,11 +219,3 @@ def _line(override: Override) -> str:
 def _renamed(override: Override) -> Override:
     line = _line(override)
     return _parser().parse_override(line.replace("algo.", "adversary.", 1))
-
-
-def _one_line(error: BaseException) -> str:
-    """What an error says, without what OmegaConf adds on further lines but for the key."""
-    if isinstance(error, OmegaConfBaseException):
-        key = f"{error.full_key}: " if error.full_key else ""
-        return key + str(error).split("\n")[0]
-    return one_line(error)

@@ -7,16 +7,12 @@ and, while a batch is trained, `batches/K/` with its checkpoints. Each batch can
 import contextlib
 import json
 import shutil
-import time
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError
-from matd3_jax.runs import divergence, lock
+from matd3_jax.runs import lock
 from matd3_jax.runs.directory import PLANS, RunDirectory
 from matd3_jax.runs.paths import is_name
 from matd3_jax.runtime import devices, files
@@ -24,18 +20,10 @@ from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.runtime.terminal import say
 from matd3_jax.sweep import batching
-from matd3_jax.tracking.messages import FINISHED, STOPPED
-from matd3_jax.training import best as best_evaluations
-from matd3_jax.training import checkpoint, film, finish, host_states, outputs, starting
-from matd3_jax.training import run as training_run
-from matd3_jax.training.film import Filmer
-from matd3_jax.training.loggers import CallbackLogger, DivergenceLogger, Logger, TableLogger
-from matd3_jax.training.memory import most_seeds, needed
-from matd3_jax.training.outputs import Outputs
-from matd3_jax.training.progress import ProgressBar
-from matd3_jax.training.rows import Row
+from matd3_jax.sweep.batch import Batch
+from matd3_jax.training import outputs, starting
+from matd3_jax.training.memory import most_seeds
 from matd3_jax.training.session import TrainingSession
-from matd3_jax.training.state import TrainState
 
 
 class Sweep:
@@ -158,7 +146,7 @@ class Sweep:
                 if self.processes.broadcast(mine and not self.finished(k)):
                     together = self.processes.part(sum(member.seeds for member in self.members(k)))
                     if together is not None:
-                        Batch(self, k, together).train(stop)
+                        self._batch(k, together).train(stop)
                 stopped = stop.agreed(self.processes)
             if stopped is not None:
                 return 128 + stopped
@@ -167,6 +155,13 @@ class Sweep:
     def members(self, batch: int) -> list[Config]:
         """Settings of the runs in a batch."""
         return [RunDirectory.open(self.runs / name)[1] for name in self.batches[batch]]
+
+    def _batch(self, batch: int, processes: Processes) -> Batch:
+        names = self.batches[batch]
+        title = f"batch {batch} ({batch + 1} of {len(self.batches)})"
+        runs = [RunDirectory(self.runs / name) for name in names]
+        group = self.folder.absolute().name
+        return Batch(title, runs, self.members(batch), self.folder_of(batch) / "checkpoints", group, processes)
 
     @contextlib.contextmanager
     def _taken(self, batch: int) -> Iterator[bool]:
@@ -199,130 +194,6 @@ class Sweep:
         for k in range(len(self.batches)):
             if self.folder_of(k).is_dir() and self.finished(k):
                 shutil.rmtree(self.folder_of(k), ignore_errors=True)
-
-
-class Batch:
-    """Runs that share one program, in one process or several."""
-
-    def __init__(self, sweep: Sweep, number: int, processes: Processes = SINGLE_PROCESS):
-        self.sweep, self.number, self.processes = sweep, number, processes
-        self.runs = [RunDirectory(sweep.runs / name) for name in sweep.batches[number]]
-        self.members = sweep.members(number)
-        self.training = TrainingSession(self.members[0], members=self.members, processes=processes)
-        self.checkpoints = sweep.folder_of(number) / "checkpoints"
-        self.seeds = film.where(self.members)
-        """Where each run's seeds are."""
-        self.table = TableLogger(self.runs, self.seeds)
-        self.watch = DivergenceLogger(
-            self.training,
-            say,
-            names=[f"{c.name}: seed {seed}" for c in self.members for seed in c.seed_numbers],
-        )
-
-    def train(self, stop: Stop) -> None:
-        """From the last checkpoint, or from the start, to the end or until a signal comes."""
-        training, begun = self.training, time.monotonic()
-        training.check_memory(recorded=True)
-        if self.processes.first:
-            self._announce()
-        state, row, fresh = self._begin()
-        with self._outputs() as out:
-            self._train(stop, state, row, fresh, begun, out)
-
-    def _outputs(self) -> Outputs:
-        """Where rows go besides the directories; nowhere from other processes than the first."""
-        there = slice(None) if self.processes.first else slice(0)
-        parts = self.runs[there], self.members[there], self.seeds[there]
-        return Outputs(*parts, say, say, self.watch.diverged, self.sweep.folder.absolute().name)
-
-    def _train(self, stop: Stop, state: TrainState, row: Row, fresh: bool, begun: float, out: Outputs) -> None:
-        training = self.training
-        loggers: list[Logger] = []
-        filmer = None
-        if self.processes.first:
-            if fresh:
-                out.log(row)
-            progress = ProgressBar(training, row, self.watch.diverged)
-            loggers = [self.table, self.watch, progress, CallbackLogger(out.log)]
-            if Filmer.wanted(self.members):
-                filmer = Filmer(training, self.runs, self.members, self.seeds, say, out.attach)
-
-        def save(state: TrainState, step: int) -> None:
-            for run in self.runs if self.processes.first else ():
-                run.sync()
-            to = self.checkpoints, step, training.trainer, state
-            checkpoint.save(*to, keep=1, share=training.share, best=training.best)
-
-        outcome = training_run.run(training, state, row, loggers, save, stop, save_first=fresh, film=filmer)
-        if outcome.stopped is not None:
-            save(outcome.state, int(outcome.row["step"][0]))
-            out.how = STOPPED
-            return
-        rates = progress.rates() if self.processes.first else {}
-        self._finish(outcome.state, outcome.row, {"seconds": round(time.monotonic() - begun, 1), **rates}, out)
-        out.how = FINISHED
-
-    def _begin(self) -> tuple[TrainState, Row, bool]:
-        """The state to train from, its row, and whether nothing was trained yet."""
-        first, broadcast = self.processes.first, self.processes.broadcast
-        for run in self.runs if first else ():
-            run.clean()
-            checkpoint.recover(run.checkpoints)
-        if first:
-            checkpoint.recover(self.checkpoints)
-        if not broadcast(bool(checkpoint.steps(self.checkpoints)) if first else None):
-            for run in self.runs if first else ():
-                run.clear()
-            given = [starting.of_directory(run.path) for run in self.runs]
-            state, row = self.training.start(starting.joined(given))
-            if first:
-                self.table.log(row)
-                self.watch.log(row)
-            return state, row, True
-        saved = Path(broadcast(str(checkpoint.verify(self.checkpoints)) if first else None))
-        for line in host_states.notes(saved, self.training.trainer, unpickle=False, sweep=True) if first else ():
-            say(line)
-        training, done = self.training, int(saved.name)
-        state = checkpoint.restore(saved, training.trainer, training.share, best=training.best)
-        self.processes.barrier()
-        for run, config, own in zip(self.runs, self.members, self.seeds, strict=True) if first else ():
-            for line in run.cut(done, self.training.expected_table(config)):
-                say(f"note: {line}")
-            known = divergence.of_run(run, done)
-            self.watch.diverged |= {own.start + seed - config.seed: found for seed, found in known.items()}
-        if first:
-            say(f"resuming from the checkpoint of env step {done:,}")
-        updates = self.training.trainer.updates(int(state.rollouts))
-        return state, {"step": np.array([done]), "updates": np.array([updates])}, False
-
-    def _finish(self, state: TrainState, row: Row, facts: Mapping[str, Any], out: Outputs) -> None:
-        """Leave each run as if it had been trained alone, but for its replay."""
-        trainer, share, done = self.training.trainer, self.training.share, int(row["step"][0])
-        facts, best = {**facts, "side_by_side": share.total}, self.training.best
-        for number, (run, config, seeds) in enumerate(zip(self.runs, self.members, self.seeds, strict=True)):
-            saved = checkpoint.save(run.checkpoints, done, trainer, state, keep=1, seeds=seeds, share=share, best=best)
-            if not self.processes.first:
-                continue
-            diverged = {
-                config.seed + place - seeds.start: found
-                for place, found in self.watch.diverged.items()
-                if seeds.start <= place < seeds.stop
-            }
-            settings = str(config.name), config.diagnostics.q_bias
-            own_facts = {**facts, **best_evaluations.summary(saved, config.seed_numbers)}
-            found = finish.finish(run, self.training.layout, *settings, done, own_facts, diverged)
-            out.finish(number, found)
-
-    def _announce(self) -> None:
-        training, config = self.training, self.members[0]
-        seeds, mesh, size = training.share.total, training.trainer.mesh, self.processes.size
-        several = f" in each of {size} processes" if size > 1 else ""
-        names = [str(member.name) for member in self.members]
-        shown = ", ".join(names if len(names) <= 4 else [*names[:2], "...", names[-1]])
-        say(f"batch {self.number} ({self.number + 1} of {len(self.sweep.batches)}): {len(names)} runs, {seeds} seeds "
-              f"in all, on {mesh.size} x {mesh.devices.flat[0].device_kind}{several}: {shown}")  # fmt: skip
-        say(f"{config.env['name']}, {training.total_steps:,} env steps each; {training.memory}; "
-              f"{needed(training.trainer, len(training.seeds)) / 1e9:.2f} GB in all")  # fmt: skip
 
 
 def _entries(folder: Path) -> list[Path]:

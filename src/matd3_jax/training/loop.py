@@ -9,15 +9,14 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
-from matd3_jax.core import frozen, minibatch, n_step, q_bias, replay, rollout, running_statistics, update
+from matd3_jax.core import q_bias, replay, rollout, running_statistics, update
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.q_bias import Pairs
 from matd3_jax.core.rollout import EnvState, Episodes, PolicyParams
-from matd3_jax.core.running_statistics import Statistics
-from matd3_jax.core.update import UpdateMetrics
 from matd3_jax.envs.environment import Environment
 from matd3_jax.training import stopping
+from matd3_jax.training.learner import Learner
 from matd3_jax.training.program import Program
 from matd3_jax.training.schedule import Schedule
 from matd3_jax.training.sharding import SeedSharding, stack, unstack
@@ -66,7 +65,6 @@ class TrainLoop:
         self.env, self.layout, self.schedule, self.num_seeds = env, layout, schedule, num_seeds
         self.unroll, self.unroll_steps = unroll, unroll_steps
         self.normalize_observations, self.q_bias_pairs = normalize_observations, q_bias_pairs
-        self.least_deviation = least_deviation
         updates = schedule.updates_per_collect
         for group in layout.learning_groups:
             delay = group.algorithm.policy_delay
@@ -76,6 +74,7 @@ class TrainLoop:
             devices_per_seed = 1
         sharding = SeedSharding(num_seeds, schedule.batch_size, devices, devices_per_seed, seeds_together)
         self.sharding, self.mesh, self.on_cpu = sharding, sharding.mesh, sharding.on_cpu
+        self.learner = Learner(layout, schedule, sharding, least_deviation, unroll)
         per_group = [hyper[layout.teams[group.members[0]]] for group in layout.groups]
         spread = jax.tree.map(lambda h: jnp.broadcast_to(jnp.asarray(h, jnp.float32), num_seeds), per_group)
         self.hyper = tuple(jax.tree.map(sharding.pad, spread))
@@ -89,13 +88,8 @@ class TrainLoop:
     # ---- the schedule in numbers -------------------------------------------------------------------------------------
 
     @cached_property
-    def period(self) -> int:
-        """Updates after which every group's policy delay has come round."""
-        return math.lcm(*(group.algorithm.policy_delay for group in self.layout.learning_groups))
-
-    @cached_property
     def rollouts_per_iteration(self) -> int:
-        return math.lcm(self.period, self.schedule.updates_per_collect) // self.schedule.updates_per_collect
+        return math.lcm(self.learner.period, self.schedule.updates_per_collect) // self.schedule.updates_per_collect
 
     @property
     def iteration_steps(self) -> int:
@@ -188,13 +182,7 @@ class TrainLoop:
             actors = tuple(g.actor_average if a else g.actor for g, a in zip(state.groups, averaged, strict=True))
             scales = tuple(g.scale for g in state.groups)
         scales = scales if any(group.frozen for group in self.layout.groups) else ()
-        return PolicyParams(actors, self.hyper if hyper is None else hyper, self.scale(state), scales)
-
-    def scale(self, state: TrainState) -> Statistics | None:
-        """What observations are normalized by: running statistics, with the least deviation that is set."""
-        if state.statistics is None or not self.least_deviation:
-            return state.statistics
-        return running_statistics.floored(state.statistics, self.least_deviation)
+        return PolicyParams(actors, self.hyper if hyper is None else hyper, self.learner.scale(state), scales)
 
     def rollout(self, state: TrainState, hyper, random: bool = False) -> tuple[TrainState, Episodes]:
         """Play one rollout of all local seeds."""
@@ -227,93 +215,12 @@ class TrainLoop:
         random = self.schedule.warmup == "random"
         return self.program(partial(self.rollout, random=random), self.schedule.warmup_rollouts)
 
-    def learn(self, state: TrainState, hyper, first: int) -> tuple[TrainState, UpdateMetrics]:
-        """Make the updates after one rollout, `seeds_together` of the local seeds at a time; `first`: number of the
-        first of them."""
-        schedule, groups = self.schedule, self.layout.groups
-        size = replay.filled(schedule.replay_capacity, schedule.rollout_steps, state.rollouts)
-        batches = 1 if schedule.shared_minibatch else self.layout.num_agents
-        unrolled = math.gcd(self.period, schedule.updates_per_collect)
-        axis = self.sharding.minibatch_axis
-
-        def period(seed, hyper, carry, keys):
-            states, metrics = carry, []
-            for u in range(unrolled):
-                index_key, update_key = jax.random.split(keys[u])
-                indices = replay.sample_indices(index_key, size, (batches, schedule.batch_size))
-                raw = self._drawn(state, hyper, seed, minibatch.own_part(indices, axis, dimension=-1))
-                others = frozen.next_actions(self.layout, states, raw)
-                rows = self._normalized(state, seed, raw)
-                move = [(first + u + 1) % group.algorithm.policy_delay == 0 for group in groups]
-                how = (schedule.sequential, self.on_cpu, axis, others)
-                states, m = update.update(self.layout, states, hyper, rows, update_key, move, *how)
-                metrics.append(m)
-            return states, jax.tree.map(lambda *m: jnp.stack(m), *metrics)
-
-        def one(args):
-            seed, states, key, hyper, stopped = args
-            if stopped is None or axis is not None:  # a branch that some devices alone take must not talk to others
-                return learned(seed, states, key, hyper)
-            nothing = jax.tree.map(
-                lambda leaf: jnp.full(leaf.shape, jnp.nan), jax.eval_shape(learned, seed, states, key, hyper)[1]
-            )
-            return jax.lax.cond(stopped, lambda: (states, nothing), lambda: learned(seed, states, key, hyper))
-
-        def learned(seed, states, key, hyper):
-            keys = jax.random.split(key, schedule.updates_per_collect).reshape(-1, unrolled)
-            if keys.shape[0] == 1:
-                states, metrics = period(seed, hyper, states, keys[0])
-            else:
-                states, metrics = jax.lax.scan(partial(period, seed, hyper), states, keys, unroll=self.unroll)
-            return states, jax.tree.map(lambda m: m.reshape(-1, m.shape[-1]), metrics)
-
-        keys = jax.vmap(partial(jax.random.split, num=2))(state.key)
-        seeds = jnp.arange(keys.shape[0])
-        if isinstance(state.groups, list):
-            rest = unstack((seeds, keys[:, 0], hyper, state.stopped), len(state.groups))
-            found = [one((seed, g, *own)) for g, (seed, *own) in zip(state.groups, rest, strict=True)]
-            states, metrics = [networks for networks, _ in found], stack([m for _, m in found])
-        else:
-            together = self.sharding.seeds_together
-            per_seed = seeds, state.groups, keys[:, 0], hyper, state.stopped
-            states, metrics = jax.lax.map(one, per_seed, batch_size=together)
-        # The next rollout writes where these updates read. Where the actor is delayed nothing else makes XLA do one
-        # after the other, and it would copy the whole replay: so let the count of rollouts, hence the next write's
-        # offset, depend on the updates. A mean squared error is never negative; XLA does not know.
-        wait = jnp.any(metrics.critic_loss < 0).astype(jnp.int32)
-        return state._replace(groups=states, key=keys[:, 1], rollouts=state.rollouts + wait), metrics
-
-    def minibatches(
-        self, state: TrainState, hyper: Sequence[HyperParams], seed: chex.Array | int, indices: chex.Array
-    ) -> chex.Array:
-        """What updates take: the rows [*indices.shape, row_size] of a local seed and its `hyper`, rewards of n_step
-        steps in them, observations normalized."""
-        return self._normalized(state, seed, self._drawn(state, hyper, seed, indices))
-
-    def _drawn(
-        self, state: TrainState, hyper: Sequence[HyperParams], seed: chex.Array | int, indices: chex.Array
-    ) -> chex.Array:
-        """`minibatches` before their observations are normalized."""
-        schedule, layout = self.schedule, self.layout
-        if layout.n_step == 1:
-            return replay.gather(state.replay, seed, indices)
-        written = replay.Written(schedule.replay_capacity, schedule.rollout_steps, state.rollouts)
-        gamma = jnp.stack([jnp.asarray(hyper[layout.place(i)[0]].gamma) for i in range(layout.num_agents)])
-        return n_step.draw(layout, state.replay, seed, indices, written, schedule.num_envs, gamma)
-
-    def _normalized(self, state: TrainState, seed: chex.Array | int, rows: chex.Array) -> chex.Array:
-        """Replay rows [..., row_size] of a local seed with x and x' as networks see them."""
-        scale = self.scale(state)
-        if scale is None:
-            return rows
-        return running_statistics.normalize_rows(self.layout, jax.tree.map(lambda s: s[seed], scale), rows)
-
     def iteration(self, state: TrainState, hyper) -> tuple[TrainState, Metrics]:
         episodes, metrics = [], []
         for c in range(self.rollouts_per_iteration):
             before = state
             state, e = self.rollout(state, hyper)
-            state, m = self.learn(state, hyper, first=c * self.schedule.updates_per_collect)
+            state, m = self.learner.learn(state, hyper, first=c * self.schedule.updates_per_collect)
             if self.stop_seeds:
                 learning = stopping.of_agents(m, self.layout.learners)
                 state = stopping.stop_diverged(before, state, e, learning)

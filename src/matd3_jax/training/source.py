@@ -91,7 +91,7 @@ class Source:
         if group.scale is not None:
             return played, self._taken(group.scale, k)
         size, seeds = self.layout.observation_sizes[number], len(self.rows)
-        statistics = self.training.trainer.scale(self.policies)
+        statistics = self.training.trainer.learner.scale(self.policies)
         if statistics is None:
             ones, most = np.ones((seeds, size), np.float32), np.finfo(np.float32).max
             return played, Scale(0 * ones, ones, np.full(seeds, most, np.float32))

@@ -1,0 +1,165 @@
+"""Runs of a sweep that are trained side by side in one program."""
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from matd3_jax.config import Config
+from matd3_jax.runs import divergence
+from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
+from matd3_jax.runtime.signals import Stop
+from matd3_jax.runtime.terminal import say
+from matd3_jax.tracking.messages import FINISHED, STOPPED
+from matd3_jax.training import best as best_evaluations
+from matd3_jax.training import checkpoint, film, finish, host_states, starting
+from matd3_jax.training import run as training_run
+from matd3_jax.training.film import Filmer
+from matd3_jax.training.loggers import CallbackLogger, DivergenceLogger, Logger, TableLogger
+from matd3_jax.training.memory import needed
+from matd3_jax.training.outputs import Outputs
+from matd3_jax.training.progress import ProgressBar
+from matd3_jax.training.rows import Row
+from matd3_jax.training.session import TrainingSession
+from matd3_jax.training.state import TrainState
+
+
+class Batch:
+    """Runs that share one program.
+
+    Args:
+        title: which of the sweep's batches it is, in words.
+        runs, members: their directories and settings.
+        checkpoints: the folder of the batch's checkpoints.
+        group: the name of the sweep, by which loggers group its runs.
+        processes: which train it together.
+    """
+
+    def __init__(
+        self,
+        title: str,
+        runs: Sequence[RunDirectory],
+        members: Sequence[Config],
+        checkpoints: Path,
+        group: str,
+        processes: Processes = SINGLE_PROCESS,
+    ):
+        self.title, self.runs, self.members = title, list(runs), list(members)
+        self.checkpoints, self.group, self.processes = checkpoints, group, processes
+        self.training = TrainingSession(self.members[0], members=self.members, processes=processes)
+        self.seeds = film.where(self.members)
+        """Where each run's seeds are."""
+        self.table = TableLogger(self.runs, self.seeds)
+        self.watch = DivergenceLogger(
+            self.training,
+            say,
+            names=[f"{c.name}: seed {seed}" for c in self.members for seed in c.seed_numbers],
+        )
+
+    def train(self, stop: Stop) -> None:
+        """From the last checkpoint, or from the start, to the end or until a signal comes."""
+        training, begun = self.training, time.monotonic()
+        training.check_memory(recorded=True)
+        if self.processes.first:
+            self._announce()
+        state, row, fresh = self._begin()
+        with self._outputs() as out:
+            self._train(stop, state, row, fresh, begun, out)
+
+    def _outputs(self) -> Outputs:
+        """Where rows go besides the directories; nowhere from other processes than the first."""
+        there = slice(None) if self.processes.first else slice(0)
+        parts = self.runs[there], self.members[there], self.seeds[there]
+        return Outputs(*parts, say, say, self.watch.diverged, self.group)
+
+    def _train(self, stop: Stop, state: TrainState, row: Row, fresh: bool, begun: float, out: Outputs) -> None:
+        training = self.training
+        loggers: list[Logger] = []
+        filmer = None
+        if self.processes.first:
+            if fresh:
+                out.log(row)
+            progress = ProgressBar(training, row, self.watch.diverged)
+            loggers = [self.table, self.watch, progress, CallbackLogger(out.log)]
+            if Filmer.wanted(self.members):
+                filmer = Filmer(training, self.runs, self.members, self.seeds, say, out.attach)
+
+        def save(state: TrainState, step: int) -> None:
+            for run in self.runs if self.processes.first else ():
+                run.sync()
+            to = self.checkpoints, step, training.trainer, state
+            checkpoint.save(*to, keep=1, share=training.share, best=training.best)
+
+        outcome = training_run.run(training, state, row, loggers, save, stop, save_first=fresh, film=filmer)
+        if outcome.stopped is not None:
+            save(outcome.state, int(outcome.row["step"][0]))
+            out.how = STOPPED
+            return
+        rates = progress.rates() if self.processes.first else {}
+        self._finish(outcome.state, outcome.row, {"seconds": round(time.monotonic() - begun, 1), **rates}, out)
+        out.how = FINISHED
+
+    def _begin(self) -> tuple[TrainState, Row, bool]:
+        """The state to train from, its row, and whether nothing was trained yet."""
+        first, broadcast = self.processes.first, self.processes.broadcast
+        for run in self.runs if first else ():
+            run.clean()
+            checkpoint.recover(run.checkpoints)
+        if first:
+            checkpoint.recover(self.checkpoints)
+        if not broadcast(bool(checkpoint.steps(self.checkpoints)) if first else None):
+            for run in self.runs if first else ():
+                run.clear()
+            given = [starting.of_directory(run.path) for run in self.runs]
+            state, row = self.training.start(starting.joined(given))
+            if first:
+                self.table.log(row)
+                self.watch.log(row)
+            return state, row, True
+        saved = Path(broadcast(str(checkpoint.verify(self.checkpoints)) if first else None))
+        for line in host_states.notes(saved, self.training.trainer, unpickle=False, sweep=True) if first else ():
+            say(line)
+        training, done = self.training, int(saved.name)
+        state = checkpoint.restore(saved, training.trainer, training.share, best=training.best)
+        self.processes.barrier()
+        for run, config, own in zip(self.runs, self.members, self.seeds, strict=True) if first else ():
+            for line in run.cut(done, self.training.expected_table(config)):
+                say(f"note: {line}")
+            known = divergence.of_run(run, done)
+            self.watch.diverged |= {own.start + seed - config.seed: found for seed, found in known.items()}
+        if first:
+            say(f"resuming from the checkpoint of env step {done:,}")
+        updates = self.training.trainer.updates(int(state.rollouts))
+        return state, {"step": np.array([done]), "updates": np.array([updates])}, False
+
+    def _finish(self, state: TrainState, row: Row, facts: Mapping[str, Any], out: Outputs) -> None:
+        """Leave each run as if it had been trained alone, but for its replay."""
+        trainer, share, done = self.training.trainer, self.training.share, int(row["step"][0])
+        facts, best = {**facts, "side_by_side": share.total}, self.training.best
+        for number, (run, config, seeds) in enumerate(zip(self.runs, self.members, self.seeds, strict=True)):
+            saved = checkpoint.save(run.checkpoints, done, trainer, state, keep=1, seeds=seeds, share=share, best=best)
+            if not self.processes.first:
+                continue
+            diverged = {
+                config.seed + place - seeds.start: found
+                for place, found in self.watch.diverged.items()
+                if seeds.start <= place < seeds.stop
+            }
+            settings = str(config.name), config.diagnostics.q_bias
+            own_facts = {**facts, **best_evaluations.summary(saved, config.seed_numbers)}
+            found = finish.finish(run, self.training.layout, *settings, done, own_facts, diverged)
+            out.finish(number, found)
+
+    def _announce(self) -> None:
+        training, config = self.training, self.members[0]
+        seeds, mesh, size = training.share.total, training.trainer.mesh, self.processes.size
+        several = f" in each of {size} processes" if size > 1 else ""
+        names = [str(member.name) for member in self.members]
+        shown = ", ".join(names if len(names) <= 4 else [*names[:2], "...", names[-1]])
+        say(f"{self.title}: {len(names)} runs, {seeds} seeds "
+              f"in all, on {mesh.size} x {mesh.devices.flat[0].device_kind}{several}: {shown}")  # fmt: skip
+        say(f"{config.env['name']}, {training.total_steps:,} env steps each; {training.memory}; "
+              f"{needed(training.trainer, len(training.seeds)) / 1e9:.2f} GB in all")  # fmt: skip
