@@ -252,7 +252,7 @@ class Torture:
             elif "note: " in ended.output:
                 self.note(fault, None, "resumed; the damaged or missing rows were named")
             else:
-                self.note(fault, None, UNNOTICED)
+                self.note(fault, None, UNNOTICED if name == "config.yaml" else LOST, wrong)
         else:
             self.note(fault, None, SAID if one_line(ended) else LOST, ended.output[-600:])
         shutil.rmtree(path.parent)

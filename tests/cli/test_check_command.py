@@ -89,6 +89,15 @@ def lose_all_rows(run):
     return ["lacks rows between env steps 0 and", "metrics: none yet"]
 
 
+def change_a_digit(run):
+    lines = (run / "metrics.csv").read_bytes().splitlines(keepends=True)
+    at = max(k for k, byte in enumerate(lines[2]) if chr(byte).isdigit())
+    other = b"7" if lines[2][at : at + 1] != b"7" else b"8"
+    lines[2] = lines[2][:at] + other + lines[2][at + 1 :]
+    (run / "metrics.csv").write_bytes(b"".join(lines))
+    return ["metrics.csv: its rows up to env step", "are not those that the checkpoint knows"]
+
+
 def tear_a_row(run):
     with (run / "metrics.csv").open("ab") as file:
         file.write(b"700,0,1")
@@ -107,7 +116,16 @@ def no_machine(run):
 
 @pytest.mark.parametrize(
     "damage",
-    [damage_checkpoint, lose_all_checkpoints_files, lose_rows, lose_all_rows, tear_a_row, half_a_summary, no_machine],
+    [
+        damage_checkpoint,
+        lose_all_checkpoints_files,
+        lose_rows,
+        lose_all_rows,
+        change_a_digit,
+        tear_a_row,
+        half_a_summary,
+        no_machine,
+    ],  # fmt: skip
 )
 def test_damages_are_named_and_the_way_on_is_one(run, damage, capsys):
     unfinished(run)
@@ -119,7 +137,7 @@ def test_damages_are_named_and_the_way_on_is_one(run, damage, capsys):
         assert RunDirectory(run).summary() is not None
         capsys.readouterr()
         code, said = checked(run, capsys)
-        assert code == int(damage in (lose_rows, lose_all_rows, no_machine))  # what cannot be made again
+        assert code == int(damage in (lose_rows, lose_all_rows, change_a_digit, no_machine))  # not to be made again
 
 
 def test_what_is_no_damage(run, capsys):

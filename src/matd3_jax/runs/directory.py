@@ -16,7 +16,7 @@ from matd3_jax import config as configuration
 from matd3_jax.config import Config
 from matd3_jax.config.diff import differing, learning, text
 from matd3_jax.errors import UserError
-from matd3_jax.runs import metrics_table
+from matd3_jax.runs import metrics_table, table_digest
 from matd3_jax.runs.metrics_table import MetricsTable
 from matd3_jax.runs.missing import Expected
 from matd3_jax.runs.paths import check_directory
@@ -188,17 +188,20 @@ class RunDirectory:
             path.unlink(missing_ok=True)
         shutil.rmtree(self.checkpoints, ignore_errors=True)
 
-    def cut(self, step: int, expected: Expected | None = None) -> list[str]:
+    def cut(
+        self, step: int, expected: Expected | None = None, checkpoint: Path | None = None, number: int = 0
+    ) -> list[str]:
         """Drop the rows after env step `step`, which will be written again, and the lines that are not whole.
 
         Args:
             expected: of the table: gives it the columns of the rows to come.
+            checkpoint, number: the checkpoint of that env step, and which of its runs this one is.
 
         Returns:
             What the table lacks, a line for each kind of loss.
         """
         kept = self.table()
-        lines = [] if expected is None else [f"{self.metrics}: {line}" for line in expected.lines(kept, step)]
+        lines = self.losses(kept, step, expected, checkpoint, number)
         kept = kept.until(step)
         if expected is not None:
             kept = expected.seen(kept).with_columns(expected.columns)
@@ -206,6 +209,15 @@ class RunDirectory:
             files.write_text(self.metrics, kept.text())
         else:
             self.metrics.unlink(missing_ok=True)
+        return lines
+
+    def losses(
+        self, table: MetricsTable, step: int, expected: Expected | None, checkpoint: Path | None, number: int = 0
+    ) -> list[str]:
+        """What its metrics table lacks up to env step `step`, or has otherwise than it was at the checkpoint."""
+        lines = [] if expected is None else [f"{self.metrics}: {line}" for line in expected.lines(table, step)]
+        if not lines and checkpoint is not None and table_digest.is_changed(checkpoint, self.metrics, number):
+            lines = [f"{self.metrics}: its rows up to env step {step:,} are not those that the checkpoint knows"]
         return lines
 
     def table(self) -> MetricsTable:

@@ -91,7 +91,8 @@ class Batch:
             for run in self.runs if self.processes.first else ():
                 run.sync()
             to = self.checkpoints, step, training.trainer, state
-            checkpoint.save(*to, keep=1, share=training.share, best=training.best)
+            tables = [run.metrics for run in self.runs]
+            checkpoint.save(*to, keep=1, share=training.share, best=training.best, tables=tables)
 
         outcome = training_run.run(training, state, row, loggers, save, stop, save_first=fresh, film=filmer)
         if outcome.stopped is not None:
@@ -125,8 +126,9 @@ class Batch:
         training, done = self.training, int(saved.name)
         state = checkpoint.restore(saved, training.trainer, training.share, best=training.best)
         self.processes.barrier()
-        for run, config, own in zip(self.runs, self.members, self.seeds, strict=True) if first else ():
-            for line in run.cut(done, self.training.expected_table(config)):
+        parts = zip(self.runs, self.members, self.seeds, strict=True)
+        for number, (run, config, own) in enumerate(parts) if first else ():
+            for line in run.cut(done, self.training.expected_table(config), saved, number):
                 say(f"note: {line}")
             known = divergence.of_run(run, done)
             self.watch.diverged |= {own.start + seed - config.seed: found for seed, found in known.items()}
@@ -140,7 +142,8 @@ class Batch:
         trainer, share, done = self.training.trainer, self.training.share, int(row["step"][0])
         facts, best = {**facts, "side_by_side": share.total}, self.training.best
         for number, (run, config, seeds) in enumerate(zip(self.runs, self.members, self.seeds, strict=True)):
-            saved = checkpoint.save(run.checkpoints, done, trainer, state, keep=1, seeds=seeds, share=share, best=best)
+            to, tables = (run.checkpoints, done, trainer, state), [run.metrics]
+            saved = checkpoint.save(*to, keep=1, seeds=seeds, share=share, best=best, tables=tables)
             if not self.processes.first:
                 continue
             diverged = {

@@ -2,7 +2,8 @@
 
 Layout of one: `STEP/state` (all but the replay; several processes write `STEP/state/FIRST`, each its seeds, from number
 FIRST on), `STEP/replay/SEED` (the rows filled so far; none in what a sweep leaves of its runs), `STEP/best/SEED.npz`
-(see `training.best`), `STEP/host/SEED` (of environments on the host that are pickled), `STEP/checksums.json`.
+(see `training.best`), `STEP/host/SEED` (of environments on the host that are pickled), `STEP/metrics.json` (see
+`runs.table_digest`), `STEP/checksums.json`.
 A checkpoint appears under its name only when it is whole. The replay is written and read one seed at a time, so that it
 never stands in memory twice. What some processes wrote any other number of them can read.
 """
@@ -26,6 +27,7 @@ import orbax.checkpoint as ocp
 
 from matd3_jax.core import replay
 from matd3_jax.errors import UserError
+from matd3_jax.runs import table_digest
 from matd3_jax.runtime import files
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Share
 from matd3_jax.training import host_states
@@ -52,6 +54,7 @@ def save(
     seeds: slice | None = None,
     share: Share | None = None,
     best: BestPolicies | None = None,
+    tables: Sequence[Path] = (),
 ) -> Path:
     """Write the checkpoint of env step `step` and delete all but the newest `keep`.
 
@@ -60,6 +63,7 @@ def save(
         share: which seeds the trainer has. Every process writes its own, the first makes a checkpoint of it. None:
             there are no others.
         best: the policies of the trainer's seeds to be kept with it.
+        tables: metrics tables of its runs, so that it is noticed when they are changed.
     """
     share = share or SINGLE_PROCESS.share(trainer.num_seeds)
     processes, wanted = share.processes, seeds or slice(0, share.total)
@@ -90,6 +94,8 @@ def save(
         written += best.write(partial_, {k - share.first: k - wanted.start for k in range(first, last)})
     if seeds is None:
         written += host_states.save(partial_, trainer, state, share)
+    if tables and processes.first:
+        written.append(table_digest.write(partial_, tables))
     parts = processes.gather_messages(json.dumps(_checksums(partial_, written)).encode())
     if processes.first:
         checksums = dict(sorted(pair for part in parts for pair in json.loads(part).items()))

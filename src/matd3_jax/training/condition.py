@@ -95,7 +95,7 @@ def of_run(path: Path) -> Condition:
     table, done = run.table(), whole[-1] if whole else 0
     expected = _expected(settings, table)
     problems = [f"checkpoint {step:,} is damaged ({why})" for step, why in damaged.items()]
-    problems += [f"{run.metrics}: {line}" for line in expected.lines(table, done)]
+    problems += run.losses(table, done, expected, run.checkpoints / str(done))
     gaps = tuple(expected.gaps(table, done))
     if (run.path / "summary.json").exists() and run.summary() is None:
         problems.append(f"{run.path / 'summary.json'} is not whole: a resume makes it again")

@@ -235,7 +235,8 @@ class Recorder:
 
     def _notes(self, training: TrainingSession, directory: RunDirectory, done: int) -> None:
         """Take the rows after env step `done` out of the metrics table, and say what it lacks."""
-        for line in directory.cut(done, training.expected_table(training.config)):
+        saved = directory.checkpoints / str(done)
+        for line in directory.cut(done, training.expected_table(training.config), saved):
             self.say(f"note: {line}")
 
     def _to_the_end(
@@ -285,7 +286,7 @@ class Recorder:
             if self.processes.first:
                 directory.sync()
             to = directory.checkpoints, step, training.trainer, state, keep
-            checkpoint.save(*to, share=training.share, best=training.best)
+            checkpoint.save(*to, share=training.share, best=training.best, tables=[directory.metrics])
 
         outcome = run(training, state, row, loggers, save, stop, save_first=fresh, film=film)
         step = int(outcome.row["step"][0])
