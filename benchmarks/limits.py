@@ -125,6 +125,12 @@ def _update(trainer: TrainLoop, group: Group) -> Iterator[tuple[Product, float]]
     yield from ((part, 2) for part in forward)  # targets, and the critics themselves
     yield Product("bi,bo->io", (batch, critic[0]), (batch, twins * critic[1])), 1
     yield from ((part, 1) for part in _backward((twins,), batch, critic)[1:])
+    if algorithm.adversarial:
+        # The slopes by which others' actions are moved: of all target critics, and of the first critic.
+        yield from ((part, 1) for part in [*forward, *_back_to_inputs(twins, batch, critic)])
+        first = _forward((1,), batch, critic)
+        first = first if critic[-1] > 1 else first[:-1]  # the slope of one scalar needs no value
+        yield from ((part, 1 / delay) for part in first + _back_to_inputs(1, batch, critic))
     k = group.action_space.size
     actor = (group.observation_size, *hidden, k)
     yield from ((part, 1 / delay) for part in _forward((), batch, actor) + _forward((1,), batch, critic))
@@ -158,6 +164,12 @@ def _backward(stack: tuple[int, ...], batch: int, sizes: Sequence[int]) -> list[
         if layer > 0 and o > 1:
             inputs.append(Product(f"{s}bo,{s}io->{s}bi", (*stack, batch, o), (*stack, i, o)))
     return kernels + inputs
+
+
+def _back_to_inputs(twins: int, batch: int, sizes: Sequence[int]) -> list[Product]:
+    """Gradients of the inputs of every layer, the first's of all twins at once."""
+    later = [part for part in _backward((twins,), batch, sizes) if part.equation.endswith("bi")]
+    return [*later, Product("bo,io->bi", (batch, twins * sizes[1]), (sizes[0], twins * sizes[1]))]
 
 
 def _batched(product: Product, together: int) -> Product:

@@ -22,6 +22,7 @@ PAPER = {
     "target_noise": 0.0,
     "target_noise_clip": 0.5,
 }
+MINIMAX = {"m3ddpg", "m3matd3"}
 FAMILY = {  # joint, critic, number of critics, policy delay
     "matd3": (False, "central", 2, 2),
     "maddpg": (False, "central", 1, 1),
@@ -29,6 +30,8 @@ FAMILY = {  # joint, critic, number of critics, policy delay
     "iddpg": (False, "own", 1, 1),
     "td3": (True, "own", 2, 2),
     "ddpg": (True, "own", 1, 1),
+    "m3ddpg": (False, "central", 1, 1),
+    "m3matd3": (False, "central", 2, 2),
 }
 
 
@@ -38,6 +41,8 @@ def test_every_algorithm_has_the_papers_settings(name):
     assert (algo.joint, algo.critic, algo.num_critics, algo.policy_delay) == FAMILY[name]
     assert {key: getattr(algo, key) for key in PAPER} == PAPER
     assert algo.name == name
+    steps = (1e-3, 1e-5) if name in MINIMAX else (0, 0)  # adv-eps and adv-eps-s of the authors of M3DDPG
+    assert (algo.adversarial_step, algo.adversarial_step_team) == steps and algo.adversarial == (name in MINIMAX)
 
 
 def test_the_default_schedule_is_the_papers():
@@ -148,6 +153,7 @@ def test_a_new_run_is_given_the_engines_new_name():
 
 
 MISTAKES = {
+    "algo.adversarial_step=-1": "algo.adversarial_step=-1.0: must not be negative",
     "algo=mad3": "matd3",
     "env=simple_sprad": "simple_spread",
     "adversary=madpg": "maddpg",
@@ -210,6 +216,13 @@ def test_every_mistake_gives_one_line_that_names_it(text):
         config.load([text])
     assert MISTAKES[text] in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("key", ["adversarial_step", "adversarial_step_team"])
+def test_who_does_not_see_the_others_cannot_fear_them(key):
+    with pytest.raises(UserError, match=rf"^adversary\.{key}=0\.1 needs adversary\.critic=central: iltd3's critics do"):
+        config.load(["env=simple_tag", "adversary=iltd3", f"adversary.{key}=0.1"])
+    assert config.load(["env=simple_tag", "adversary=iltd3", f"algo.{key}=0.1"]).algo.adversarial
 
 
 @pytest.mark.parametrize(

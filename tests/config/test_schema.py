@@ -43,7 +43,8 @@ def test_every_field_says_what_it_affects_and_has_no_default(cls):
 @pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(AlgoConfig)])
 def test_what_a_setting_of_an_algorithm_affects(name):
     """Numbers go to the hyper-parameters, all else to the shape: as `core` has them."""
-    algo = dataclasses.replace(config.load().algo, target_noise=0.1)  # with smoothing, so that its noise is a number
+    # With smoothing and a step of the others, so that their lengths are numbers.
+    algo = dataclasses.replace(config.load().algo, target_noise=0.1, adversarial_step=0.1)
     other = dataclasses.replace(algo, **{name: OTHER.get(name, 0.4321)})
     learning = name in schema.HYPER_PARAMS
     if name.startswith("policy") and name != "policy_delay":  # what a frozen team begins with, not what is computed

@@ -1,5 +1,7 @@
 """Teams that do not learn: what they play, and that the others learn from it what they should."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -51,10 +53,14 @@ def test_its_networks_stay_the_same_to_the_bit(how):
     assert np.isnan(np.asarray(metrics.update.critic_loss)).all(axis=(0, 1)).tolist() == [True, False, False]
 
 
-def test_learners_updates_are_those_against_opponents_that_stand_still():
-    """One update from the same rows: the same networks, optimizers and losses, to rounding."""
+@pytest.mark.parametrize("adversarial", [False, True])
+def test_learners_updates_are_those_against_opponents_that_stand_still(adversarial):
+    """One update from the same rows: the same networks, optimizers and losses, to rounding; adversarial: what opponents
+    do is moved against the learners, whether they learn or not."""
     env = make("simple_adversary", actions="continuous")
-    teams = {"agents": LEARNER, "adversaries": Algorithm(hidden=(5,))}
+    learner = dataclasses.replace(LEARNER, adversarial=adversarial)
+    teams = {"agents": learner, "adversaries": Algorithm(hidden=(5,))}
+    steps = {"adversarial_step": 0.3, "adversarial_step_team": 0.1} if adversarial else {}
     plain = JointLayout.of(env, teams)
     other = JointLayout.of(env, {**teams, "adversaries": Algorithm(hidden=(5,), frozen=True)})
     key, rng = jax.random.key(3), np.random.default_rng(0)
@@ -77,7 +83,7 @@ def test_learners_updates_are_those_against_opponents_that_stand_still():
     assert [one is None for one in others] == [k != g for k in range(len(others))]
 
     def learners(layout, state, frozen_next):
-        hyper = [HYPER._replace(target_noise=0.0) for _ in layout.groups]
+        hyper = [HYPER._replace(target_noise=0.0, **steps) for _ in layout.groups]
         return jax.jit(
             lambda rows: update.update(layout, state, hyper, rows, key, [True] * 2, frozen_next=frozen_next)
         )(rows)

@@ -127,7 +127,8 @@ def test_update_equals_reference(name):
 
 
 @pytest.mark.parametrize(
-    "name", ["matd3", "box", "n-step", "tanh", "matd3-shared-sequential", "layer-norm", "categorical-3-steps"]
+    "name",
+    ["matd3", "box", "n-step", "tanh", "matd3-shared-sequential", "layer-norm", "categorical-3-steps", "m3matd3-box"],
 )
 def test_large_minibatches_are_computed_alike(name, monkeypatch):
     """The program that large minibatches get (a loop over agents, products that transpose) against the reference."""
@@ -162,6 +163,9 @@ def test_some_norms_are_clipped_and_some_are_not():
         ("matd3-shared-sequential", "sequential", False),
         ("interleaved", "sequential", False),
         ("categorical", "algorithm.critic_range", (-2.0, 1.6)),
+        ("m3ddpg", "hyper.adversarial_step", 0.5999),
+        ("m3matd3-box", "hyper.adversarial_step_team", 0.2499),
+        ("m3matd3-interleaved", "algorithm.adversarial", False),
     ],
 )
 def test_reference_distinguishes(name, field, value):

@@ -70,6 +70,7 @@ class Case:
                 target_noise_clip=0.95 - 0.05 * g,
                 logit_regularizer=0.02 * (1 + g),
                 max_grad_norm=0.15 + 0.05 * g,  # some variables are clipped and some are not
+                **({} if h.adversarial_step is None else ADVERSARIAL),
             )
             for g, h in enumerate(base)
         ]
@@ -94,6 +95,9 @@ def interleaved(algorithm) -> JointLayout:
 
 DISTRIBUTION: Mapping = {"critic_head": "categorical", "critic_atoms": 7, "critic_range": (-2.0, 1.5)}
 """So narrow that some returns are moved beyond both ends."""
+
+ADVERSARIAL: Mapping = {"adversarial_step": 0.6, "adversarial_step_team": 0.25}
+"""So long that some actions are moved out of a Box."""
 
 CASES = {
     # The six of the family, each as its configuration file says.
@@ -147,6 +151,15 @@ CASES = {
     ),
     "categorical-layer-norm": Case(
         "point_reach", "matd3", changes=DISTRIBUTION | {"critic_norm": "layer", "clip": "none"}, sequential=True
+    ),
+    # Others' actions moved against each agent.
+    "m3ddpg": Case("simple_tag", "m3ddpg", changes={"hidden": (6, 5)}),
+    "m3matd3": Case("simple_adversary", "m3matd3", "m3ddpg", n_step=2),
+    "m3matd3-box": Case("point_reach", "m3matd3", changes={"smoothing": True, "actor_output": "tanh"}, shared=True),
+    "m3matd3-interleaved": Case("interleaved", "m3matd3", one_by_one=False),
+    "m3matd3-categorical": Case("simple_push", "m3matd3", "maddpg", changes=DISTRIBUTION, shared=True, sequential=True),
+    "m3ddpg-discrete": Case(
+        "simple_crypto", "m3ddpg", "td3", options={"actions": "discrete"}, changes={"critic_norm": "layer"}
     ),
     "discrete": Case(
         "simple_spread", "maddpg", options={"actions": "discrete"}, changes={"clip": "none", "adam": "epsilon_hat"}
@@ -232,6 +245,7 @@ def agents_of(layout, state, hyper):
                 actor_adam=adam(s.actor_optimizer, k),
                 critic_adams=[adam(s.critic_optimizer, k, c) for c in critics],
                 average=None if s.actor_average is None else layers(s.actor_average, k),
+                team=layout.teams[i],
             )
     return [agents[i] for i in range(layout.num_agents)]
 

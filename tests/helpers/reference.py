@@ -160,6 +160,30 @@ def smooth(space, action, normal, sigma, bound):
     return action + epsilon
 
 
+def worst_case(agents, i, x, actions, value_slope, steps):
+    """The joint action after one step of every agent but i against agent i, row after row: `steps[j]` long, against the
+    gradient of its critic's value, in half ranges and within the bounds for a Box (M3DDPG).
+
+    value_slope: of inputs [batch, inputs]: the gradient of the values' sum with respect to them.
+    """
+    slope = value_slope(np.concatenate([*x, *actions], axis=1))
+    cuts = np.cumsum([part.shape[1] for part in (*x, *actions)])[:-1]
+    slopes = np.split(slope, cuts, axis=1)[len(x) :]
+    moved = []
+    for j, (agent, action, gradient) in enumerate(zip(agents, actions, slopes, strict=True)):
+        new = action.copy()
+        for b, row in enumerate(gradient):
+            length = np.sqrt(row @ row)
+            if j == i or length == 0:
+                continue
+            half = (agent.space.high - agent.space.low) / 2 if is_box(agent.space) else 1
+            new[b] -= steps[j] * half * row / length
+            if is_box(agent.space):
+                new[b] = np.minimum(np.maximum(new[b], agent.space.low), agent.space.high)
+        moved.append(new)
+    return moved
+
+
 # ---- optimizer -------------------------------------------------------------------------------------------------------
 
 
@@ -234,6 +258,7 @@ class Agent:
     actor_adam: Adam
     critic_adams: list
     average: list | None = None
+    team: str = ""
 
 
 def take_apart(rows, agents):
@@ -291,6 +316,21 @@ def update(agents, batches, gumbel, normal, move, sequential):
                 noise = normal(other.space.size)
                 action = smooth(other.space, action, noise, h.target_noise, h.target_noise_clip)
             next_a.append(action)
+        alphas = [h.adversarial_step_team if other.team == agent.team else h.adversarial_step for other in agents]
+        if algorithm.adversarial:
+
+            def slope_of_least(read, agent=agent, critic=critic):
+                """Of min_j Q'_j: row by row that of the critic with the smaller value."""
+                passes = [forward(target, read) for target in agent.critic_targets]
+                values = [critic.value(output) for output, _ in passes]
+                slopes = [
+                    backward(target, kept, slope)[1]
+                    for target, (_, kept), (_, slope) in zip(agent.critic_targets, passes, values, strict=True)
+                ]
+                smallest = np.argmin([value for value, _ in values], axis=0)
+                return np.array([slopes[c][b] for b, c in enumerate(smallest)])
+
+            next_a = worst_case(agents, i, next_x, next_a, slope_of_least, alphas)
         read = np.concatenate([*next_x, *next_a] if central else [next_x[i], next_a[i]], axis=1)
         outputs = [forward(target, read)[0] for target in agent.critic_targets]
         y = critic.target(outputs, algorithm.reward_scale * r[i], h.gamma * discount)
@@ -318,6 +358,13 @@ def update(agents, batches, gumbel, normal, move, sequential):
         output, kept = forward(agent.actor, x[i])
         own, kept_act = act(agent.space, output, gumbel(agent.space.size), algorithm.actor_output)
         mixed = [own if j == i else a[j] for j in range(len(agents))]
+        if algorithm.adversarial:
+
+            def slope_of_first(read, agent=agent, critic=critic):
+                output, kept = forward(agent.critics[0], read)
+                return backward(agent.critics[0], kept, critic.value(output)[1])[1]
+
+            mixed = worst_case(agents, i, x, mixed, slope_of_first, alphas)
         q, kept_q = forward(agent.critics[0], np.concatenate([*x, *mixed] if central else [x[i], own], axis=1))
         q, slope = critic.value(q)
         metrics[2, i] = -q.mean() + h.logit_regularizer * (output**2).mean()

@@ -42,6 +42,19 @@ def test_shapes_and_schedules_do_not(override):
     assert batching.program(load(override)) != batching.program(load())
 
 
+def test_lengths_of_the_others_step_share_a_program_but_none_is_another():
+    one, other, team, none = (
+        batching.program(load("algo=m3ddpg", *steps))
+        for steps in (
+            [],
+            ["algo.adversarial_step=0.1", "algo.adversarial_step_team=0"],
+            ["algo.adversarial_step=0"],
+            ["algo.adversarial_step=0", "algo.adversarial_step_team=0"],
+        )
+    )
+    assert one == other == team != none
+
+
 @pytest.mark.slow
 def test_settings_that_share_a_program_compile_to_the_same_text():
     """What `program` says is what XLA sees: the lowered interval does not depend on the members' numbers."""
@@ -53,6 +66,10 @@ def test_settings_that_share_a_program_compile_to_the_same_text():
 
     assert lowered("algo.lr=0.3", "algo.tau=0.5", "algo.gamma=0.1") == lowered()
     assert lowered("algo.target_noise=0.2") != lowered()
+    # Without a step M3DDPG is MADDPG and M3MATD3 is MATD3: the same program, hence the same run to the bit.
+    still = ("algo.adversarial_step=0", "algo.adversarial_step_team=0")
+    assert lowered("algo=m3matd3", *still) == lowered() != lowered("algo=m3matd3")
+    assert lowered("algo=m3ddpg", *still) == lowered("algo=maddpg")
 
 
 def test_only_missing_seeds_are_planned(tmp_path):

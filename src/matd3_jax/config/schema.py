@@ -70,6 +70,8 @@ class AlgoConfig:
     policy_delay: int = setting(SHAPES, least=1)
     target_noise: float = setting(LEARNING, least=0)
     target_noise_clip: float = setting(LEARNING, least=0)
+    adversarial_step: float = setting(LEARNING, least=0, before=0.0)
+    adversarial_step_team: float = setting(LEARNING, least=0, before=0.0)
     actor_lr: float = setting(LEARNING, above=0)
     critic_lr: float = setting(LEARNING, above=0)
     gamma: float = setting(LEARNING, least=0, most=1)
@@ -93,10 +95,17 @@ class AlgoConfig:
     policy_checkpoint: str | None = setting(SHAPES, before=None, text=True)
     policy_seed: int | None = setting(SHAPES, before=None, least=0)
 
+    @property
+    def adversarial(self) -> bool:
+        """Whether the others' actions are moved against each agent."""
+        return self.adversarial_step > 0 or self.adversarial_step_team > 0
+
     def algorithm(self) -> Algorithm:
         """What fixes the shape of the learner."""
         noise_range = isinstance(self.exploration_noise, tuple)
-        derived: dict[str, Any] = {"smoothing": self.target_noise > 0, "noise_range": noise_range}
+        derived: dict[str, Any] = {
+            "smoothing": self.target_noise > 0, "noise_range": noise_range, "adversarial": self.adversarial
+        }  # fmt: skip
         shared = {field.name for field in dataclasses.fields(Algorithm)} - set(derived)
         return Algorithm(**derived, **{name: getattr(self, name) for name in shared})
 
@@ -105,6 +114,8 @@ class AlgoConfig:
         noise = self.exploration_noise
         low, high = noise if isinstance(noise, tuple) else (noise, noise)
         same = {name: getattr(self, name) for name in HYPER_PARAMS if name != "exploration_noise"}
+        if not self.adversarial:  # no numbers of the program then
+            same |= dict.fromkeys(("adversarial_step", "adversarial_step_team"))
         return HyperParams(**same, exploration_noise=low, exploration_noise_high=high)
 
 

@@ -106,6 +106,12 @@ def _check_team(name: str, team: "AlgoConfig", updates: int, need: Any) -> None:
     if isinstance(team.exploration_noise, tuple):
         low, high = team.exploration_noise
         need(low <= high, f"{name}.exploration_noise=[{low},{high}]: a range [low,high] must not end below its start")
+    for key in ("adversarial_step", "adversarial_step_team"):
+        need(
+            team.critic == "central" or not getattr(team, key),
+            f"{name}.{key}={getattr(team, key)} needs {name}.critic=central: {team.name}'s critics do not see the "
+            "others' actions",
+        )
     need(
         team.critic_head != "categorical" or team.critic_range is not None,
         f"{name}.critic_head=categorical needs the range of returns: {name}.critic_range=[low,high]",

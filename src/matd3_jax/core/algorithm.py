@@ -1,4 +1,4 @@
-"""The family as data: MATD3, MADDPG, IL-TD3, IDDPG, TD3 and DDPG are points of one space."""
+"""The family as data: MATD3, MADDPG, M3DDPG, IL-TD3, IDDPG, TD3 and DDPG are points of one space."""
 
 import dataclasses
 from typing import Literal, NamedTuple
@@ -45,6 +45,9 @@ class Algorithm:
     """The exploration noise of each environment and agent is drawn from a range at the start of every episode."""
     smoothing: bool = False
     """Add clipped Gaussian noise to the targets' actions (target policy smoothing)."""
+    adversarial: bool = False
+    """Targets and actor losses take the others' actions as they would hurt the agent most, one gradient step away
+    (M3DDPG)."""
     frozen: bool = False
     """The team plays a given policy, deterministically, and does not learn: it has no critics and no targets."""
     sync_targets: bool = True
@@ -72,3 +75,8 @@ class HyperParams(NamedTuple):
     max_grad_norm: chex.Array | float
     exploration_noise_high: chex.Array | float = 0.0
     """The upper end; read with `Algorithm.noise_range` only."""
+    adversarial_step: chex.Array | float | None = None
+    """Length of the step of other teams' actions against the agent, of Box actions in half ranges; None unless
+    `Algorithm.adversarial`."""
+    adversarial_step_team: chex.Array | float | None = None
+    """The same of agents of its own team."""

@@ -2,12 +2,14 @@
 
 Symbols (section 4): x joint observation, o_i agent i's part, a joint action, mu actor, Q critic, primes targets. With
 one critic and no smoothing these are MADDPG's (Lowe et al. 2017); with the observation and action of the agent alone
-TD3's and DDPG's (Fujimoto et al. 2018).
+TD3's and DDPG's (Fujimoto et al. 2018); with the others' actions moved against the agent (`worst_case`) M3DDPG's (Li
+et al. 2019).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import chex
+import jax
 import jax.numpy as jnp
 
 from matd3_jax.core.agents import Group, JointLayout
@@ -15,15 +17,30 @@ from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.minibatch import Minibatch, Noise
 from matd3_jax.core.networks import apply
 
+SMALLEST_SLOPE = 1e-12
+"""Gradients with a smaller norm are divided by this instead: none at all (dead ReLUs) moves nothing."""
+
 
 def td_target(
-    group: Group, hyper: HyperParams, critic_target: chex.ArrayTree, batch: Minibatch, next_action: chex.Array
+    layout: JointLayout,
+    group: Group,
+    hyper: HyperParams,
+    critic_target: chex.ArrayTree,
+    batch: Minibatch,
+    next_action: chex.Array,
 ) -> chex.Array:
     """y_i = r_i + gamma min_j Q'_ij(x', a'_1, ..., a'_N), with a' = mu'(o') + epsilon from `target_actions`.
 
-    Returns what the critics' loss takes, leading axis [batch]. Where an episode terminated y_i = r_i.
+    Adversarial: the others' a' moved against what the target takes, min_j Q'_ij. Returns what the critics' loss takes,
+    leading axis [batch]. Where an episode terminated y_i = r_i.
     """
     next_inputs = jnp.concatenate([batch.next_x, next_action], axis=-1)
+    if group.algorithm.adversarial:
+
+        def least(inputs: chex.Array) -> chex.Array:
+            return group.critic.values(critic_target, inputs).min(axis=0)
+
+        next_inputs = worst_case(layout, hyper, least, next_inputs, batch.action_column)
     scale = group.algorithm.reward_scale
     reward = batch.reward if scale == 1 else scale * batch.reward
     return group.critic.target(critic_target, reward, hyper.gamma * batch.discount, next_inputs)
@@ -69,12 +86,54 @@ def critic_loss(
 
 
 def actor_loss(
-    group: Group, hyper: HyperParams, params: chex.ArrayTree, critic: chex.ArrayTree, batch: Minibatch, noise: Noise
+    layout: JointLayout,
+    group: Group,
+    hyper: HyperParams,
+    params: chex.ArrayTree,
+    critic: chex.ArrayTree,
+    batch: Minibatch,
+    noise: Noise,
 ) -> tuple[chex.Array, chex.Array]:
     """-mean Q_i1(x, a_1, ..., mu_i(o_i), ..., a_N) + regularizer * mean mu_i's output^2, the others' actions from the
-    replay; twice, as value and as metric."""
+    replay, adversarial: moved against Q_i1 there; twice, as value and as metric."""
     output = apply(group.actor, params, batch.observation)
     action = group.policy.sample(output, noise.action)
-    q = group.critic.value(critic, batch.inputs, action - batch.action, batch.action_column)
+    inputs, change = batch.inputs, action - batch.action
+    if group.algorithm.adversarial:
+
+        def climbed(inputs: chex.Array) -> chex.Array:
+            return group.critic.value(critic, inputs, jax.lax.stop_gradient(change), batch.action_column)
+
+        inputs = worst_case(layout, hyper, climbed, inputs, batch.action_column)
+    q = group.critic.value(critic, inputs, change, batch.action_column)
     loss = -q.mean() + hyper.logit_regularizer * jnp.mean(jnp.square(output))
     return loss, loss
+
+
+def worst_case(
+    layout: JointLayout,
+    hyper: HyperParams,
+    value: Callable[[chex.Array], chex.Array],
+    inputs: chex.Array,
+    own_column: chex.Array | int,
+) -> chex.Array:
+    """The `inputs` of a central critic after one step of every other agent against the one that acts at `own_column`:
+    a_j - alpha_j g_j / |g_j| with g_j = d value / d a_j, for each row [batch] by itself (Li et al. 2019, multi-agent
+    adversarial learning; the length as in their program).
+
+    alpha_j is `adversarial_step_team` for agents of the same team and `adversarial_step` for all others, frozen ones
+    too; of Box actions in half ranges, and they stay within their bounds. A constant to whoever differentiates.
+    """
+    x, action = jnp.split(inputs, [layout.observation_size], axis=-1)
+    slope = jax.grad(lambda inputs: value(inputs).sum())(inputs)[..., layout.observation_size :]
+    own = layout.observation_size + jnp.array(layout.action_starts) == own_column
+    same_team = jnp.array([[one == other for other in layout.teams] for one in layout.teams])
+    team = (own[:, None] & same_team).any(axis=0)
+    steps = jnp.where(team, hyper.adversarial_step_team, hyper.adversarial_step)
+    moved = []
+    for j in range(layout.num_agents):
+        part, gradient = layout.action_part(action, j), layout.action_part(slope, j)
+        norm = jnp.linalg.norm(gradient, axis=-1, keepdims=True)
+        shifted = layout.policy(j).shift(part, -steps[j] * gradient / jnp.maximum(norm, SMALLEST_SLOPE))
+        moved.append(jnp.where(own[j], part, shifted))
+    return jax.lax.stop_gradient(jnp.concatenate([x, *moved], axis=-1))

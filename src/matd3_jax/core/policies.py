@@ -33,6 +33,9 @@ class Policy(Protocol):
     def smooth(self, action: chex.Array, draw: chex.Array, sigma: chex.Array, clip: chex.Array) -> chex.Array:
         """Target policy smoothing (the paper's equation for y_i): clip(sigma * draw, -clip, clip) added to actions."""
 
+    def shift(self, action: chex.Array, change: chex.Array) -> chex.Array:
+        """Actions with `change` added to them, of a Box in half ranges and no further than its bounds."""
+
     def noise(self, key: chex.PRNGKey, shape: tuple[int, ...]) -> chex.Array:
         """What `sample` takes while exploring, [*shape, size]."""
 
@@ -80,8 +83,10 @@ class DeterministicPolicy:
         return action if draw is None else self._inside(action + scale * self.half * draw)
 
     def smooth(self, action: chex.Array, draw: chex.Array, sigma: chex.Array, clip: chex.Array) -> chex.Array:
-        epsilon = jnp.clip(sigma * draw, -clip, clip)
-        return self._inside(action + epsilon * self.half)
+        return self.shift(action, jnp.clip(sigma * draw, -clip, clip))
+
+    def shift(self, action: chex.Array, change: chex.Array) -> chex.Array:
+        return self._inside(action + change * self.half)
 
     def noise(self, key: chex.PRNGKey, shape: tuple[int, ...]) -> chex.Array:
         return flat_draw(jax.random.normal, key, (*shape, self.size))
@@ -118,8 +123,11 @@ class CategoricalPolicy:
         return self.mode(output if draw is None else output + draw)
 
     def smooth(self, action: chex.Array, draw: chex.Array, sigma: chex.Array, clip: chex.Array) -> chex.Array:
+        return self.shift(action, jnp.clip(sigma * draw, -clip, clip))
+
+    def shift(self, action: chex.Array, change: chex.Array) -> chex.Array:
         """Added to the vectors without projecting back, as in the authors' program."""
-        return action + jnp.clip(sigma * draw, -clip, clip)
+        return action + change
 
     def noise(self, key: chex.PRNGKey, shape: tuple[int, ...]) -> chex.Array:
         return flat_draw(jax.random.gumbel, key, (*shape, self.size))

@@ -195,7 +195,7 @@ def _update_agent(
     algorithm = group.algorithm
     if next_action is None:
         next_action = losses.target_actions(layout, group, hyper, mu_targets, own_target, batch, noise)
-    y = losses.td_target(group, hyper, state.critic_target, batch, next_action)
+    y = losses.td_target(layout, group, hyper, state.critic_target, batch, next_action)
 
     critic_gradient = jax.grad(lambda params: losses.critic_loss(group, params, batch, y), has_aux=True)
     gradients, (loss, q_value) = _mean_over(axis, critic_gradient(state.critic))
@@ -207,7 +207,7 @@ def _update_agent(
         return state, (loss, q_value, jnp.full((), jnp.nan))
 
     actor_gradient = jax.grad(
-        lambda params: losses.actor_loss(group, hyper, params, q_params, batch, noise), has_aux=True
+        lambda params: losses.actor_loss(layout, group, hyper, params, q_params, batch, noise), has_aux=True
     )
     gradients, mu_loss = _mean_over(axis, actor_gradient(state.actor))
     mu_params, mu_optimizer = optimizer.apply(

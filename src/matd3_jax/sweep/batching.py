@@ -22,6 +22,7 @@ def program(config: Config) -> str:
         if isinstance(team.exploration_noise, tuple):
             free["exploration_noise"] = (0.0, 0.0)
         free["target_noise"] = float(team.algorithm().smoothing)  # without noise a program has no smoothing in it
+        free["adversarial_step"] = float(team.adversarial)
         return dataclasses.replace(team, **free)
 
     adversary = None if config.adversary is None else shape(config.adversary)

@@ -62,10 +62,14 @@ def _member(layout: JointLayout, schedule: Schedule, group: Group) -> float:
             target_actions /= len(group.members)
     # The targets' values, the critics' own, their gradients.
     critics = algorithm.num_critics * (3 * _forward(critic) + _inputs(critic))
+    # Where others' actions are moved: values at the actions as they are, and back to the first layer's inputs.
+    slopes = (_forward(critic) + _inputs(critic) + critic[0] * critic[1]) if algorithm.adversarial else 0
     # Through the first critic back to the own action: its part of the first layer's inputs, once each way.
     through = _forward(critic) + _inputs(critic) + 2 * size * critic[1]
-    actors = 2 * _forward(actor) + _inputs(actor) + through
-    return target_actions + critics + actors / algorithm.policy_delay
+    actors = 2 * _forward(actor) + _inputs(actor) + through + slopes
+    if algorithm.adversarial and critic[-1] == 1:
+        actors -= critic[-2]  # the slope of one scalar needs no value
+    return target_actions + critics + algorithm.num_critics * slopes + actors / algorithm.policy_delay
 
 
 def _actor(group: Group) -> tuple[int, ...]:
