@@ -3,6 +3,7 @@
 import dataclasses
 import glob
 import math
+import re
 import shlex
 import subprocess
 import sys
@@ -160,6 +161,21 @@ def test_what_is_missing_is_named():
         CLOSED.parse(["count=3"])
     with pytest.raises(UserError, match="^where=: must name a file or directory$"):
         CLOSED.parse(["where="])
+
+
+@pytest.mark.parametrize("name", arguments.COMMANDS)
+def test_what_is_missing_of_our_commands_is_said_without_its_values(name):
+    """`KEY=... is missing: what it is`: not what each value means."""
+    command = arguments.COMMANDS[name]
+    given: list[str] = []
+    while True:
+        try:
+            command.parse(given)
+            return
+        except UserError as error:
+            said = re.fullmatch(r"(\w+)=(\S+) is missing: ([^:;]+)", str(error))
+        assert said, "another message"
+        given.append(f"{said[1]}={said[2].split('|')[0]}")
 
 
 def test_a_file_may_not_be_a_directory(tmp_path):

@@ -50,6 +50,31 @@ def whole(tmp_path_factory) -> Path:
     return out / "whole"
 
 
+@pytest.mark.parametrize(
+    "env, wanted",
+    [
+        (["env=simple_tag", "adversary=maddpg"], "simple_tag-matd3-vs-maddpg"),
+        (["env=jaxmarl", "env.id=MPE_simple_tag_v3"], "jaxmarl-MPE_simple_tag_v3-matd3"),
+        (["env=pettingzoo", "env.id=mpe2.simple_tag_v3:env"], "pettingzoo-mpe2.simple_tag_v3_env-matd3"),
+        (["env=gymnasium", "env.id='../CartPole-v1'"], "gymnasium-.._CartPole-v1-matd3"),
+        (["env=playground", "env.id=CheetahRun"], "playground-CheetahRun-matd3"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)  # fmt: skip
+def test_a_run_without_a_name_is_called_after_its_environment_algorithm_and_time(env, wanted, tmp_path, monkeypatch):
+    """One part of a path, which tells the environments of another library apart."""
+    asked = []
+
+    def start(self, settings, path, or_another):
+        asked.append(path)
+        raise UserError("enough")
+
+    monkeypatch.setattr(train.Recorder, "start", start)
+    with pytest.raises(UserError, match="^enough$"):
+        train.main([*env, f"out={tmp_path}"])
+    assert asked[0].parent == tmp_path and re.fullmatch(re.escape(wanted) + r"-\d{8}-\d{6}", asked[0].name)
+
+
 def test_a_run_leaves_all_its_files(whole):
     assert {p.name for p in whole.iterdir()} == {
         "config.yaml", "machine.json", "metrics.csv", "checkpoints", "learning_curve.png", "summary.json", ".lock",

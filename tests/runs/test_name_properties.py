@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import tempfile
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from properties import examples, texts
 from matd3_jax import config
 from matd3_jax.errors import UserError
 from matd3_jax.runs.directory import RunDirectory
-from matd3_jax.runs.paths import check_directory, inside, is_name
+from matd3_jax.runs.paths import as_part, check_directory, inside, is_name
 from matd3_jax.sweep.search_space import Axis, names
 
 SETTINGS = config.load(["env=point_reach"])
@@ -61,6 +62,16 @@ def test_a_name_from_a_file_is_one_directory_in_another(value):
         with parent() as folder:
             (folder / value).mkdir()
             assert [path.name for path in folder.iterdir()] == [value]
+
+
+@given(st.one_of(paths, texts))
+@example("package:Name-v0")
+@example("x" * 300)
+@examples(60)
+def test_a_text_is_made_a_part_of_a_name(text):
+    made = as_part(text)
+    assert re.fullmatch(r"[A-Za-z0-9.+_-]{0,100}", made) and is_name(f"x-{made}-x")
+    assert made == text or re.search(r"[^A-Za-z0-9.+_-]", text) or len(text) > 100
 
 
 @given(paths)

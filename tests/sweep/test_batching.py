@@ -140,6 +140,19 @@ def test_the_computed_memory_covers_the_compiled_program(more):
     assert computed <= 2 * used + 2 * trainer.replay_bytes / seeds
 
 
+def test_the_computed_memory_has_the_policies_that_are_kept():
+    """Of both teams, with what observations are normalized by: one seed's arrays are counted as they are written down,
+    for every seed and twice, since they are taken over before the old ones go."""
+    training = TrainingSession(load("normalize_observations=true", "adversary=maddpg", "adversary.hidden=[5]"))
+    state = training.trainer.init(training.keys())
+    training.best.note(0, state, np.zeros((2, 4, training.layout.num_agents)))
+    written = sum(array.nbytes for found in training.best.found for array in found.policies.values())
+    actors = 4 * sum(seen * hidden + hidden + hidden * 5 + 5 for seen, hidden in ((19, 8), (8, 5)))
+    assert written > actors + 4 * 2 * (19 + 8)
+    assert memory.parts(training.trainer, 2)["best"].size == 2 * written
+    assert memory.parts(training.trainer, 6)["best"].size == 3 * 2 * written
+
+
 def test_the_most_seeds_are_those_that_just_fit():
     trainer = TrainingSession(load("replay_capacity=100000", "total_steps=100000")).trainer
     for budget in (memory.needed(trainer, 1), memory.needed(trainer, 5) + 1, memory.PROCESS + 10**9):

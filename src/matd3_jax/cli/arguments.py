@@ -206,8 +206,8 @@ class Export(OfOneRun):
     """
 
     format: str = option(
-        "onnx: a model for each agent; numpy: an .npz, and a reader that needs NumPy alone; saved_fn: functions that "
-        "JAX saved (StableHLO), of any network",
+        "which kind of files; onnx: a model for each agent; numpy: an .npz, and a reader that needs NumPy alone; "
+        "saved_fn: functions that JAX saved (StableHLO), of any network",
         choices=("onnx", "numpy", "saved_fn"),
     )  # fmt: skip
     seed: int | None = option("which of the run's seeds", default=None, least=0, otherwise="the first")

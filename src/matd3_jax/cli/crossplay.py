@@ -10,13 +10,14 @@ from rich.table import Table
 
 from matd3_jax.cli import arguments
 from matd3_jax.cli.arguments import CrossPlay
+from matd3_jax.config import diff
 from matd3_jax.evaluation import entrants
 from matd3_jax.evaluation.cross_play import TEAMS
 from matd3_jax.evaluation.cross_play_table import Mean, Pairings
 from matd3_jax.evaluation.entrants import Entrant
 from matd3_jax.figures import heat_map
 from matd3_jax.runs import divergence
-from matd3_jax.runs.paths import check_new_directory
+from matd3_jax.runs.paths import as_part, check_new_directory
 from matd3_jax.runtime import devices, files
 from matd3_jax.runtime.terminal import say, show
 
@@ -29,7 +30,8 @@ def main(argv: Sequence[str]) -> int:
     devices.prepare()
     matched = options.pairing == "matched"
     entered, env = entrants.load(options.runs, options.checkpoint, matched, options.episodes)
-    name = f"{entered[0].settings.env['name']}-{time.strftime('%Y%m%d-%H%M%S')}"
+    env_name = diff.environment(entered[0].settings)
+    name = f"{as_part(env_name)}-{time.strftime('%Y%m%d-%H%M%S')}"
     out = options.out or Path("crossplay") / name
     check_new_directory(out, "out")
     pairings = entrants.play(
@@ -38,7 +40,7 @@ def main(argv: Sequence[str]) -> int:
     out.mkdir(parents=True, exist_ok=True)
     kind = "deterministic" if options.deterministic else "sampled"
     who = "seed with seed" if matched else "seeds x seeds"
-    title = f"{entered[0].settings.env['name']}, {who}, {options.episodes} {kind} episodes of each pair"
+    title = f"{env_name}, {who}, {options.episodes} {kind} episodes of each pair"
     for entrant in entered:
         if entrant.diverged:
             say(f"{entrant.name}: {divergence.of_seeds(entrant.settings.seeds, entrant.diverged)}, left out")

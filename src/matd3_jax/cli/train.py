@@ -6,9 +6,9 @@ from pathlib import Path
 
 from matd3_jax import config
 from matd3_jax.cli import arguments, command, options
-from matd3_jax.config import Config
+from matd3_jax.config import Config, diff
 from matd3_jax.errors import UserError
-from matd3_jax.runs.paths import inside
+from matd3_jax.runs.paths import as_part, inside
 from matd3_jax.runtime import devices, multihost, slurm
 from matd3_jax.runtime.terminal import say
 from matd3_jax.training.recording import Recorded, Recorder
@@ -75,4 +75,4 @@ def _total_steps(overrides: Sequence[str]) -> int | None:
 def _name(settings: Config) -> str:
     """A name for a run without one: what it trains, and when."""
     against = f"-vs-{settings.adversary.name}" if settings.adversary else ""
-    return f"{settings.env['name']}-{settings.algo.name}{against}-{time.strftime('%Y%m%d-%H%M%S')}"
+    return f"{as_part(diff.environment(settings))}-{settings.algo.name}{against}-{time.strftime('%Y%m%d-%H%M%S')}"

@@ -79,6 +79,11 @@ def label_differences(configs: Sequence[Config]) -> list[str]:
     return labels
 
 
+def environment(config: Config) -> str:
+    """The environment of a run in a few words: its name, and of another library's what that calls it."""
+    return " ".join(str(config.env[key]) for key in ("name", "id") if config.env.get(key) is not None)
+
+
 def algorithms(config: Config) -> str:
     """`matd3`, or `matd3 vs maddpg` where the adversaries have another."""
     other = config.teams()["adversaries"].name

@@ -28,7 +28,7 @@ def groups(paths: Sequence[Path]) -> dict[tuple[Path, ...], Config]:
 
 def common(settings: Sequence[Config]) -> str:
     """Environment and algorithms, where they are the same in all runs of several."""
-    environments = list(dict.fromkeys(str(one.env["name"]) for one in settings))
+    environments = list(dict.fromkeys(diff.environment(one) for one in settings))
     names = list(dict.fromkeys(map(diff.algorithms, settings)))
     parts = environments if len(environments) == 1 else []
     return ", ".join([*parts, *(names if len(names) == 1 < len(settings) else [])])

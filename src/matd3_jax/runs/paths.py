@@ -11,6 +11,8 @@ from matd3_jax.errors import UserError
 
 LONGEST_NAME = 255
 """Bytes of a file's name, on all usual file systems."""
+LONGEST_PART = 100
+"""Characters of one part among others of a name that we make."""
 
 
 def paths(texts: Sequence[str], key: str = "runs") -> tuple[Path, ...]:
@@ -34,6 +36,13 @@ def paths(texts: Sequence[str], key: str = "runs") -> tuple[Path, ...]:
 def is_name(value: object) -> bool:
     """Whether a value from a file can be the name of a directory in another: one part of a path, that leads nowhere."""
     return isinstance(value, str) and _is_part(value) and value == Path(value).name and "\\" not in value
+
+
+def as_part(text: str) -> str:
+    """A text as a part of a directory's name: spaces become `-`, all but ASCII letters, digits and `.+-_` becomes `_`,
+    and of a long one only the beginning is left."""
+    plain = text.replace(" ", "-")
+    return "".join(c if c.isascii() and (c.isalnum() or c in ".+-_") else "_" for c in plain)[:LONGEST_PART]
 
 
 def inside(parent: Path, name: str, key: str) -> Path:

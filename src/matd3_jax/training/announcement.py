@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+from matd3_jax.config import diff
 from matd3_jax.runs import divergence, overestimation, summary
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runs.divergence import Divergence
@@ -78,7 +79,7 @@ def title(training: TrainingSession) -> str:
     """The environment and the algorithms of a run in a few words."""
     teams = {team: training.config.teams()[team] for team in training.layout.teams}
     names = [f"{'frozen ' * algo.frozen}{algo.name}" for algo in teams.values()]
-    return f"{training.config.env['name']}: " + " against ".join(dict.fromkeys(names))
+    return f"{diff.environment(training.config)}: " + " against ".join(dict.fromkeys(names))
 
 
 def _robot_lines(training: TrainingSession) -> list[str]:

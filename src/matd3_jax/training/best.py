@@ -144,7 +144,7 @@ def played(checkpoint: Path, state: TrainState, seeds: int) -> tuple[TrainState,
             raise UserError(f"{checkpoint / FOLDER}: {name} does not fit these settings")
         rows += rows[-1:] * (leaf.shape[0] - seeds)
         new[name] = jax.device_put(np.stack(rows), leaf.sharding)
-    part = _policies(state)
+    part = kept(state)
     paths, structure = jax.tree_util.tree_flatten_with_path(part)
     part = jax.tree.unflatten(structure, [new[jax.tree_util.keystr(path)] for path, _ in paths])
     groups = tuple(
@@ -154,7 +154,7 @@ def played(checkpoint: Path, state: TrainState, seeds: int) -> tuple[TrainState,
     return state._replace(groups=groups, statistics=part.statistics), found
 
 
-def _policies(state: TrainState) -> TrainState:
+def kept(state: TrainState) -> TrainState:
     """The part of a state that is kept; all else None."""
 
     def actors(group: GroupState) -> GroupState:
@@ -169,5 +169,5 @@ def _policies(state: TrainState) -> TrainState:
 
 
 def _leaves(state: TrainState) -> dict[str, Any]:
-    found = jax.tree_util.tree_flatten_with_path(_policies(state))[0]
+    found = jax.tree_util.tree_flatten_with_path(kept(state))[0]
     return {jax.tree_util.keystr(path): leaf for path, leaf in found}

@@ -12,6 +12,7 @@ from matd3_jax.core import rollout
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.envs.environment import Environment
 from matd3_jax.errors import UserError
+from matd3_jax.training import best
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.sharding import idle_devices
 
@@ -53,6 +54,8 @@ def parts(trainer: TrainLoop, seeds: int, episodes: int = 0) -> dict[str, Part]:
         max(group.algorithm.num_critics for group in trainer.layout.learning_groups),
     )
     many = most > 2
+    # Kept on the host, and all of them once more while those of the better seeds are taken over.
+    kept = 2 * rows * size(best.kept(state)) // trainer.sharding.padded_seeds if trainer.on_cpu else 0
     return {
         "replay": Part(copies * replay, "the replay", "replay_capacity", capacity),
         # A checkpoint is written seed by seed: one seed's replay on its way out, and once more in the writer's hands.
@@ -63,6 +66,7 @@ def parts(trainer: TrainLoop, seeds: int, episodes: int = 0) -> dict[str, Part]:
             "algo.num_critics" if many else "algo.hidden",
             most if many else None,
         ),
+        "best": Part(kept, "the policies of the best evaluations", "algo.hidden"),
         "environments": Part(copies * others, "environments and a rollout", "num_envs", schedule.num_envs),
         "updates": Part(together * update_bytes(trainer), "an update", "batch_size", schedule.batch_size),
         "evaluation": Part(
