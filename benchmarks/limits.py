@@ -131,6 +131,10 @@ def _update(trainer: TrainLoop, group: Group) -> Iterator[tuple[Product, float]]
         first = _forward((1,), batch, critic)
         first = first if critic[-1] > 1 else first[:-1]  # the slope of one scalar needs no value
         yield from ((part, 1 / delay) for part in first + _back_to_inputs(1, batch, critic))
+    for other in layout.learning_groups if trainer.schedule.random_order and central else ():
+        # What everybody does by now, before each actor moves.
+        sizes = (other.observation_size, *other.algorithm.hidden, other.action_space.size)
+        yield from ((part, 1 / delay) for part in _forward((len(other.members),), batch, sizes))
     k = group.action_space.size
     actor = (group.observation_size, *hidden, k)
     yield from ((part, 1 / delay) for part in _forward((), batch, actor) + _forward((1,), batch, critic))

@@ -29,6 +29,7 @@ SMALL = ("total_steps=100", "replay_capacity=100", "learning_starts=100", "batch
             "updates_per_collect=4",
         ),
         ("seeds=2", "env=simple_speaker_listener", "algo=td3", "algo.hidden=[8,6,4]"),
+        ("seeds=2", "update_order=random_sequential", "algo.policy_delay=1"),
         ("seeds=2", "env=simple_tag", "algo=m3matd3", "adversary=m3ddpg", "adversary.hidden=[5]"),
         ("seeds=2", "algo.critic_norm=layer", "algo.critic_head=categorical", "algo.critic_range=[-50,0]"),
     ],

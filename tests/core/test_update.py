@@ -10,9 +10,10 @@ import pytest
 import reference
 from learner_cases import BATCH, CASES, agents_of, drawn, numbers, random_rows, random_state
 
-from matd3_jax.core import networks, update
+from matd3_jax.core import networks, sequential_actors, update
 from matd3_jax.core.policies import CategoricalPolicy, DeterministicPolicy
 
+KEY = jax.random.key(0)
 TOLERANCE = 1e-10
 """Absolute and relative, both sides in float64: sums of some hundred terms round at about 1e-14, Adam's division by
 roots of second moments as small as 1e-13 (weights move 0.01 m / sqrt(v)) enlarges that some hundred times. The smallest
@@ -36,7 +37,8 @@ class Program:
         self.batches = 1 if case.shared else self.layout.num_agents
 
         def run(state, rows):
-            key, options = jax.random.key(0), {"sequential": case.sequential, "one_by_one": case.one_by_one}
+            key, options = KEY, {"sequential": case.sequential, "one_by_one": case.one_by_one}
+            options["random_order"] = case.random_order
             rows = drawn(self.layout, rows, self.hyper)
             return update.update(self.layout, state, self.hyper, rows, key, self.move, **options)
 
@@ -69,7 +71,7 @@ class Program:
         with jax.enable_x64(True):
             return random_state(self.layout, rng), random_rows(self.layout, rng, self.batches)
 
-    def reference(self, state, rows, sequential=None, alter=lambda agent: None):
+    def reference(self, state, rows, sequential=None, alter=lambda agent: None, order="drawn"):
         agents = agents_of(self.layout, state, self.hyper)
         for agent in agents:
             alter(agent)
@@ -80,7 +82,15 @@ class Program:
             normal=functools.partial(noise_table, "normal"),
             move=[self.layout.teams[i] not in self.case.still for i in range(len(agents))],
             sequential=self.case.sequential if sequential is None else sequential,
+            order=self.order() if order == "drawn" else order,
         )
+
+    def order(self):
+        """Of the actors that move, where they move in random order."""
+        if not self.case.random_order:
+            return None
+        moving = [i for i, team in enumerate(self.layout.teams) if team not in self.case.still]
+        return sequential_actors.permutation(KEY, moving).tolist()
 
     def agents(self, state):
         return agents_of(self.layout, state, self.hyper)
@@ -162,6 +172,8 @@ def test_some_norms_are_clipped_and_some_are_not():
         ("matd3", "sequential", True),
         ("matd3-shared-sequential", "sequential", False),
         ("interleaved", "sequential", False),
+        ("random-order", "order", lambda order: None),
+        ("random-order-interleaved", "order", lambda order: order[::-1]),
         ("categorical", "algorithm.critic_range", (-2.0, 1.6)),
         ("m3ddpg", "hyper.adversarial_step", 0.5999),
         ("m3matd3-box", "hyper.adversarial_step_team", 0.2499),
@@ -188,7 +200,8 @@ def test_reference_distinguishes(name, field, value):
         wrong, _, _ = p.reference(state, rows)
     else:
         sequential = value if field == "sequential" else None
-        wrong, _, _ = p.reference(state, rows, sequential=sequential, alter=alter)
+        order = p.order() and value(p.order()) if field == "order" else "drawn"
+        wrong, _, _ = p.reference(state, rows, sequential=sequential, alter=alter, order=order)
     gaps = [
         np.abs(np.asarray(a) - b).max()
         for one, other in zip(map(numbers, right), map(numbers, wrong), strict=True)

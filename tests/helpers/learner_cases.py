@@ -30,6 +30,7 @@ class Case:
     changes: Mapping = dataclasses.field(default_factory=dict)
     shared: bool = False
     sequential: bool = False
+    random_order: bool = False
     still: tuple[str, ...] = ()
     """Teams whose actors and targets do not move in this update."""
     one_by_one: bool = True
@@ -125,6 +126,15 @@ CASES = {
     "matd3-shared-sequential": Case("simple_spread", "matd3", shared=True, sequential=True),
     "interleaved": Case("interleaved", "matd3", sequential=True, changes={"smoothing": True}),
     "interleaved-shared": Case("interleaved", "matd3", shared=True, one_by_one=False, changes={"smoothing": True}),
+    # Actors one after another in random order, against the policies as they are by then.
+    "random-order": Case("simple_tag", "matd3", "maddpg", random_order=True, n_step=2),
+    "random-order-interleaved": Case("interleaved", "matd3", random_order=True, changes={"smoothing": True}),
+    "random-order-box": Case(
+        "point_reach", "m3matd3", changes={"actor_output": "tanh"}, shared=True, random_order=True
+    ),
+    "random-order-own": Case(
+        "simple_adversary", "iltd3", "maddpg", random_order=True, still=("adversaries",), one_by_one=False
+    ),
     # Returns of several steps, discounted by each team's own gamma.
     "n-step": Case("simple_tag", "matd3", "maddpg", n_step=3),
     "n-step-own": Case("simple_crypto", "iltd3", shared=True, one_by_one=False, n_step=4),

@@ -287,7 +287,7 @@ def long_step(rows, agents, gamma):
     return np.delete(long, goes_on, axis=1)
 
 
-def update(agents, batches, gumbel, normal, move, sequential):
+def update(agents, batches, gumbel, normal, move, sequential, order=None):
     """One update. Returns (agents after it, metrics [3, agents], number of clipped norms).
 
     Args:
@@ -295,6 +295,8 @@ def update(agents, batches, gumbel, normal, move, sequential):
         gumbel, normal: functions of an action size: the noise [batch, size] of every sample, and of the smoothing.
         move: for each agent whether its actor and targets move.
         sequential: agents see the moved target actors of those before them.
+        order: numbers of the agents whose actors move, one after another when all critics have learned, each with what
+            the others' actors do by then; None: with the replayed actions, each right after its critics.
     """
     before, agents = agents, copy.deepcopy(agents)
     metrics, clipped = np.full((3, len(agents)), np.nan), 0
@@ -304,8 +306,7 @@ def update(agents, batches, gumbel, normal, move, sequential):
         if rows.ndim == 3:
             rows = long_step(rows, agents, h.gamma)
         x, a, r, next_x, discount = take_apart(rows, agents)
-        batch, central = len(batches[i]), algorithm.critic == "central"
-        critic = head(algorithm)
+        central, critic = algorithm.critic == "central", head(algorithm)
 
         # Target: r + gamma min_j Q'_j(x', mu'(o')), bootstrapping unless terminated.
         next_a = []
@@ -351,36 +352,56 @@ def update(agents, batches, gumbel, normal, move, sequential):
                 agent.critics[c], agent.critic_adams[c], gradients, h.critic_lr, algorithm.adam
             )
         metrics[0, i] = np.mean(losses)
-        if not move[i]:
-            continue
-
-        # Actor: climbs the first critic (as it now is) with its own action drawn again and the others' as replayed.
-        output, kept = forward(agent.actor, x[i])
-        own, kept_act = act(agent.space, output, gumbel(agent.space.size), algorithm.actor_output)
-        mixed = [own if j == i else a[j] for j in range(len(agents))]
-        if algorithm.adversarial:
-
-            def slope_of_first(read, agent=agent, critic=critic):
-                output, kept = forward(agent.critics[0], read)
-                return backward(agent.critics[0], kept, critic.value(output)[1])[1]
-
-            mixed = worst_case(agents, i, x, mixed, slope_of_first, alphas)
-        q, kept_q = forward(agent.critics[0], np.concatenate([*x, *mixed] if central else [x[i], own], axis=1))
-        q, slope = critic.value(q)
-        metrics[2, i] = -q.mean() + h.logit_regularizer * (output**2).mean()
-        _, slope = backward(agent.critics[0], kept_q, -slope / batch)
-        start = sum(o.shape[1] for o in x) + sum(o.shape[1] for o in a[:i]) if central else x[i].shape[1]
-        slope = act_slope(agent.space, kept_act, slope[:, start : start + agent.space.size])
-        slope = slope + h.logit_regularizer * 2 * output / output.size
-        gradients, _ = backward(agent.actor, kept, slope)
-        gradients, count = clip(gradients, algorithm.clip, h.max_grad_norm)
-        clipped += count
-        agent.actor, agent.actor_adam = adam_step(agent.actor, agent.actor_adam, gradients, h.actor_lr, algorithm.adam)
-
-        agent.actor_target = towards(agent.actor_target, agent.actor, h.tau)
-        if agent.average is not None:
-            agent.average = towards(agent.average, agent.actor, algorithm.actor_average)
-        agent.critic_targets = [
-            towards(target, online, h.tau) for target, online in zip(agent.critic_targets, agent.critics, strict=True)
+        if move[i] and order is None:
+            metrics[2, i], count = move_actor(agents, i, x, a, gumbel, alphas)
+            clipped += count
+    for i in order or ():
+        agent, rows = agents[i], batches[i] if batches[i].ndim == 2 else batches[i][:, 0]
+        if batches[i].ndim == 3:  # x and actions are those of the first step
+            rows = np.delete(rows, rows.shape[1] - sum(one.observation_size for one in agents) - 2, axis=1)
+        x = take_apart(rows, agents)[0]
+        acted = [
+            act(one.space, forward(one.actor, x[j])[0], gumbel(one.space.size), one.algorithm.actor_output)[0]
+            for j, one in enumerate(agents)
         ]
+        alphas = [agent.hyper.adversarial_step_team if one.team == agent.team else agent.hyper.adversarial_step
+                  for one in agents]  # fmt: skip
+        metrics[2, i], count = move_actor(agents, i, x, acted, gumbel, alphas)
+        clipped += count
     return agents, metrics, clipped
+
+
+def move_actor(agents, i, x, a, gumbel, alphas):
+    """Move actor and targets of agent i with the others' actions `a`. Returns (actor loss, number of clipped norms)."""
+    agent = agents[i]
+    h, algorithm, batch, critic = agent.hyper, agent.algorithm, len(x[0]), head(agent.algorithm)
+    central = algorithm.critic == "central"
+    # Climbs the first critic (as it now is) with its own action drawn again.
+    output, kept = forward(agent.actor, x[i])
+    own, kept_act = act(agent.space, output, gumbel(agent.space.size), algorithm.actor_output)
+    mixed = [own if j == i else a[j] for j in range(len(agents))]
+    if algorithm.adversarial:
+
+        def slope_of_first(read):
+            output, kept = forward(agent.critics[0], read)
+            return backward(agent.critics[0], kept, critic.value(output)[1])[1]
+
+        mixed = worst_case(agents, i, x, mixed, slope_of_first, alphas)
+    q, kept_q = forward(agent.critics[0], np.concatenate([*x, *mixed] if central else [x[i], own], axis=1))
+    q, slope = critic.value(q)
+    loss = -q.mean() + h.logit_regularizer * (output**2).mean()
+    _, slope = backward(agent.critics[0], kept_q, -slope / batch)
+    start = sum(o.shape[1] for o in x) + sum(o.shape[1] for o in a[:i]) if central else x[i].shape[1]
+    slope = act_slope(agent.space, kept_act, slope[:, start : start + agent.space.size])
+    slope = slope + h.logit_regularizer * 2 * output / output.size
+    gradients, _ = backward(agent.actor, kept, slope)
+    gradients, clipped = clip(gradients, algorithm.clip, h.max_grad_norm)
+    agent.actor, agent.actor_adam = adam_step(agent.actor, agent.actor_adam, gradients, h.actor_lr, algorithm.adam)
+
+    agent.actor_target = towards(agent.actor_target, agent.actor, h.tau)
+    if agent.average is not None:
+        agent.average = towards(agent.average, agent.actor, algorithm.actor_average)
+    agent.critic_targets = [
+        towards(target, online, h.tau) for target, online in zip(agent.critic_targets, agent.critics, strict=True)
+    ]
+    return loss, clipped

@@ -29,6 +29,7 @@ def training(*settings, **options):
         ("env=simple_tag", "algo=matd3", "adversary=iddpg", "adversary.hidden=[30]", "updates_per_collect=4"),
         ("env=simple_tag", "algo=maddpg", "adversary=iltd3", "shared_minibatch=true", "algo.policy_delay=2"),
         ("env=simple_tag", "algo=m3matd3", "adversary=m3ddpg"),
+        ("env=simple_tag", "algo=matd3", "adversary=iltd3", "update_order=random_sequential"),
         ("env=simple_tag", "algo=m3ddpg", "algo.critic_head=categorical", "algo.critic_range=[-9,9]"),
         (*ANT, "env.split=halves"),
         ("env=ant", "env.split=4x2", *WIDE),

@@ -167,7 +167,7 @@ class Config:
     updates_per_collect: int = setting(SHAPES, least=1)
     batch_size: int = setting(SHAPES, least=1)
     shared_minibatch: bool = setting(SHAPES)
-    update_order: str = setting(SHAPES, choices=("simultaneous", "sequential"))
+    update_order: str = setting(SHAPES, choices=("simultaneous", "sequential", "random_sequential"))
     n_step: int = setting(SHAPES, least=1, before=1)
     normalize_observations: bool = setting(SHAPES, before=False)
     normalize_least_deviation: float = setting(SHAPES, least=0, before=0.0)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optax
 from jax.flatten_util import ravel_pytree
 
-from matd3_jax.core import losses, minibatch, networks, optimizer
+from matd3_jax.core import losses, minibatch, networks, optimizer, sequential_actors
 from matd3_jax.core.agents import Group, JointLayout
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.frozen import Scale, unscaled
@@ -90,6 +90,7 @@ def update(
     one_by_one: bool = False,
     axis: str | None = None,
     frozen_next: tuple[chex.Array | None, ...] = (),
+    random_order: bool = False,
 ) -> tuple[tuple[GroupState, ...], UpdateMetrics]:
     """One update of every agent's critics, and of actors and targets where `move` says so.
 
@@ -105,6 +106,8 @@ def update(
         axis: mesh axis whose devices share the work of each minibatch: `rows` are this device's equal part of it (the
             first rows on the first device), gradients are averaged over all. None: one device has the whole.
         frozen_next: what frozen groups do in x' of the rows (`frozen.next_actions`).
+        random_order: actors move one after another in random order, after all critics, against the others' policies as
+            they are by then instead of their replayed actions (see `sequential_actors`).
     """
     mu_targets = [group.actor_target for group in state]
     keys = jax.random.split(key, len(layout.groups))
@@ -135,11 +138,22 @@ def update(
         def f(args):
             state, own_target, batch, noise = args
             batch = cut(g, batch) if one_by_one else batch
+            moves = move[g] and not random_order
             return _update_agent(
-                layout, layout.groups[g], hyper[g], move[g], axis, targets, state, own_target, batch, noise, next_action
+                layout, layout.groups[g], hyper[g], moves, axis, targets, state, own_target, batch, noise, next_action
             )
 
         return f
+
+    def move_actor(g: int, k: chex.Array, states: tuple) -> tuple[tuple, chex.Array]:
+        """Of member k of a group, against the policies in `states`."""
+        own, place, noise = jax.tree.map(lambda leaf: jnp.asarray(leaf)[k], (states[g], places[g], noises[g]))
+        batch, group = cut(g, place), layout.groups[g]
+        if group.algorithm.critic == "central":
+            batch = sequential_actors.by_policies(layout, group, [s.actor for s in states], batch, noise)
+        own, loss = _move_actor(layout, group, hyper[g], axis, own, batch, noise)
+        after = jax.tree.map(lambda old, one: old.at[k].set(one), states[g], own)
+        return (*states[:g], after, *states[g + 1 :]), loss
 
     if sequential:
         for i in range(layout.num_agents):
@@ -164,6 +178,11 @@ def update(
                 next_action = losses.target_actions(layout, group, hyper[g], mu_targets, own_target, batch, noise)
             new[g], m = _each_member(member(g, mu_targets, next_action), args, one_by_one, rows.shape[1])
             metrics = metrics.at[:, jnp.array(group.members)].set(jnp.stack(m))
+    moving = [i for i in layout.learners if move[layout.place(i)[0]]]
+    if random_order and moving:
+        moved, actor_losses = sequential_actors.move(layout, key, tuple(new), moving, move_actor)
+        new = list(moved)
+        metrics = metrics.at[2].set(actor_losses)
     return tuple(new), UpdateMetrics(*metrics)
 
 
@@ -205,7 +224,21 @@ def _update_agent(
     state = state._replace(critic=q_params, critic_optimizer=q_optimizer)
     if not move:
         return state, (loss, q_value, jnp.full((), jnp.nan))
+    state, mu_loss = _move_actor(layout, group, hyper, axis, state, batch, noise)
+    return state, (loss, q_value, mu_loss)
 
+
+def _move_actor(
+    layout: JointLayout,
+    group: Group,
+    hyper: HyperParams,
+    axis: str | None,
+    state: GroupState,
+    batch: Minibatch,
+    noise: Noise,
+) -> tuple[GroupState, chex.Array]:
+    """Actor and targets of one agent, whose critics have learned already: its state, and the actor loss."""
+    algorithm, q_params = group.algorithm, state.critic
     actor_gradient = jax.grad(
         lambda params: losses.actor_loss(layout, group, hyper, params, q_params, batch, noise), has_aux=True
     )
@@ -223,7 +256,7 @@ def _update_agent(
     if algorithm.actor_average:
         average = optax.incremental_update(mu_params, state.actor_average, algorithm.actor_average)
         state = state._replace(actor_average=average)
-    return state, (loss, q_value, mu_loss)
+    return state, mu_loss
 
 
 def _mean_over(axis: str | None, tree: chex.ArrayTree) -> chex.ArrayTree:

@@ -69,6 +69,8 @@ def _member(layout: JointLayout, schedule: Schedule, group: Group) -> float:
     actors = 2 * _forward(actor) + _inputs(actor) + through + slopes
     if algorithm.adversarial and critic[-1] == 1:
         actors -= critic[-2]  # the slope of one scalar needs no value
+    if schedule.random_order and algorithm.critic == "central":  # everybody's actions in x, by the policies of now
+        actors += sum(len(other.members) * _forward(_actor(other)) for other in layout.learning_groups)
     return target_actions + critics + algorithm.num_critics * slopes + actors / algorithm.policy_delay
 
 

@@ -62,7 +62,7 @@ class Learner:
                 others = frozen.next_actions(self.layout, states, raw)
                 rows = self._normalized(state, seed, raw)
                 move = [(first + u + 1) % group.algorithm.policy_delay == 0 for group in groups]
-                how = (schedule.sequential, self.sharding.on_cpu, axis, others)
+                how = (schedule.sequential, self.sharding.on_cpu, axis, others, schedule.random_order)
                 states, m = update.update(self.layout, states, hyper, rows, update_key, move, *how)
                 metrics.append(m)
             return states, jax.tree.map(lambda *m: jnp.stack(m), *metrics)

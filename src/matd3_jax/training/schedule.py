@@ -27,6 +27,8 @@ class Schedule:
     """One minibatch (and one set of target actions) for all agents instead of one each."""
     sequential: bool = False
     """Update the agents one after another (see `update.update`)."""
+    random_order: bool = False
+    """Move the actors one after another in random order (see `update.update`)."""
 
     @property
     def rollout_steps(self) -> int:

@@ -91,6 +91,7 @@ class TrainingSession:
             warmup=config.warmup,
             shared_minibatch=config.shared_minibatch,
             sequential=config.update_order == "sequential",
+            random_order=config.update_order == "random_sequential",
         )
         hyper = {team: self._hyper(team) for team in teams}
         seeds, normalize = len(self.seeds), config.normalize_observations
