@@ -16,7 +16,6 @@ from matd3_jax.stats.intervals import mean_interval, t_interval
 from matd3_jax.stats.text import NOTHING, ends, number, seeds
 
 NAMES = {"matd3": "MATD3", "maddpg": "MADDPG", "iltd3": "IL-TD3", "td3": "SA-TD3", "iddpg": "IDDPG", "ddpg": "DDPG"}
-NAMES |= {"m3ddpg": "M3DDPG", "m3matd3": "M3MATD3"}
 COLORS = {
     "matd3": web(style.BLUE),
     "maddpg": web(style.ORANGE),

@@ -124,6 +124,7 @@ def worst_case(
     alpha_j is `adversarial_step_team` for agents of the same team and `adversarial_step` for all others, frozen ones
     too; of Box actions in half ranges, and they stay within their bounds. A constant to whoever differentiates.
     """
+    assert hyper.adversarial_step is not None and hyper.adversarial_step_team is not None
     x, action = jnp.split(inputs, [layout.observation_size], axis=-1)
     slope = jax.grad(lambda inputs: value(inputs).sum())(inputs)[..., layout.observation_size :]
     own = layout.observation_size + jnp.array(layout.action_starts) == own_column
