@@ -42,7 +42,7 @@ PAIRS = (("M3DDPG", "MADDPG"), ("M3DDPG, 0.1", "MADDPG"), ("M3MATD3", "MATD3"), 
 
 SCALES = {
     "paper": ["seeds=10", "total_steps=1500000", "log_every=12500"],
-    "small": ["seeds=4", "total_steps=125000", "log_every=5000"],
+    "small": ["seeds=5", "total_steps=250000", "log_every=5000"],
 }
 KEYS = {"algo": "algo.name", "step": "algo.adversarial_step"}
 
