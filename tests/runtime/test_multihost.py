@@ -396,3 +396,31 @@ def test_a_sweep_shares_the_seeds_of_each_batch(tmp_path, monkeypatch):
         states = [checkpoint.restore_actors(path, TrainingSession(setting).trainer) for path in saved]
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), *(s.groups for s in states))
     assert not (tmp_path / "2" / "batches" / "0").exists()
+
+
+@pytest.mark.slow
+def test_processes_begin_with_the_networks_of_another_run(tmp_path, monkeypatch):
+    """Each with those of its own seeds (here seeds 2 to 4 of three processes' run, seed 4 with the source's seed 0,
+    counted round), and against the same frozen team, as the run of one process does."""
+    monkeypatch.setattr(ocp, "StandardCheckpointer", OneAtATime)
+    small = ["env=simple_push", *TINY[1:], "checkpoint_every=0", "eval_every=0", "total_steps=400"]
+    Recorder().start(config.load([*small, "seeds=2"]), tmp_path / "source")
+    begun = [f"init={tmp_path / 'source'}", f"adversary.policy={tmp_path / 'source'}", "adversary.frozen=true"]
+    settings = config.load([*small, *begun, "seed=2", "seeds=3"])
+
+    def work(processes):
+        return Recorder(processes).start(settings, tmp_path / f"of {processes.size}").training.seeds.tolist()
+
+    found, _ = together(2, work)
+    assert found == [[2, 3], [4]]
+    assert together(1, work)[0] == [[2, 3, 4]]
+    several, one = tmp_path / "of 2", tmp_path / "of 1"
+    for name, given in leaves_of_start(several).items():
+        np.testing.assert_array_equal(given, leaves_of_start(one)[name])
+    same_numbers(table(several), table(one))
+    same_numbers(leaves(several), leaves(one), rtol=1e-4)
+
+
+def leaves_of_start(run: Path) -> dict[str, np.ndarray]:
+    with np.load(run / "start.npz") as file:
+        return {name: file[name] for name in file.files}

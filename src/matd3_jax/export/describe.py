@@ -7,7 +7,7 @@ from typing import Any
 import matd3_jax
 from matd3_jax.envs.environment import Environment
 from matd3_jax.envs.spaces import ActionSpace, Box, Discrete, MultiDiscrete, Simplex
-from matd3_jax.envs.wrappers.joint_team import JointTeam
+from matd3_jax.envs.wrappers.joint_team import JointTeam, innermost
 from matd3_jax.training.session import TrainingSession
 
 
@@ -19,7 +19,7 @@ def facts(training: TrainingSession, seed: int, step: int, which: str) -> dict[s
         step: env step at which the policies were kept.
         which: "best evaluation" or "checkpoint".
     """
-    env, base = training.env, _innermost(training.env)
+    env, base = training.env, innermost(training.env)
     names, actions = env.observation_names, env.action_names
     agents = []
     for i, agent in enumerate(env.agents):
@@ -53,12 +53,6 @@ def facts(training: TrainingSession, seed: int, step: int, which: str) -> dict[s
         "agents": agents,
         **_robot(base),
     }
-
-
-def _innermost(env: Environment) -> Environment:
-    while isinstance(env, JointTeam):
-        env = env.env
-    return env
 
 
 def _space(space: ActionSpace) -> dict[str, Any]:

@@ -7,12 +7,15 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
+from matd3_jax import envs
 from matd3_jax.config import Config
 from matd3_jax.config.schema import AlgoConfig
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.frozen import Scale
 from matd3_jax.core.running_statistics import CLIP, LEAST_VARIANCE, Statistics
 from matd3_jax.core.update import GroupState
+from matd3_jax.envs.environment import Environment
+from matd3_jax.envs.wrappers.joint_team import innermost
 from matd3_jax.errors import UserError
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.training import saved_policies
@@ -33,15 +36,26 @@ class Source:
         checkpoint: "last", "best" or an env step; None: the last.
         seeds: numbers of the seeds that begin with it.
         fixed: number of the one seed that all of them take; None: seed s takes s, counted round where there are fewer.
+        env: of the run that begins with it; the other's, too, where that was given one as an object of the same class.
     """
 
-    def __init__(self, key: str, path: str, checkpoint: str | None, seeds: Sequence[int], fixed: int | None):
+    def __init__(
+        self,
+        key: str,
+        path: str,
+        checkpoint: str | None,
+        seeds: Sequence[int],
+        fixed: int | None,
+        env: Environment,
+    ):
         self.name = f"{key}={path}"
         try:
             run, self.settings = RunDirectory.open(Path(path))
         except UserError as error:
             raise UserError(f"{self.name}: {error}") from error
-        self.training = TrainingSession(self.settings)
+        name = self.settings.env["name"]
+        own = env if name == type(env).__name__ and name not in envs.names() else None
+        self.training = TrainingSession(self.settings, own)
         which = int(checkpoint) if checkpoint is not None and checkpoint.isdigit() else checkpoint
         try:
             saved = saved_policies.load(run, self.training, which)
@@ -116,9 +130,10 @@ def of(settings: Config, training: TrainingSession) -> "Leaves":
     """
     seeds = settings.seed_numbers
     layout, template = training.layout, training.trainer.abstract_state()
+    env = innermost(training.env)
     init = None
     if settings.init is not None:
-        init = Source("init", settings.init, settings.init_checkpoint, seeds, settings.init_seed)
+        init = Source("init", settings.init, settings.init_checkpoint, seeds, settings.init_seed, env)
         _check_normalization(settings, init)
     groups = []
     for g, group in enumerate(layout.groups):
@@ -126,7 +141,7 @@ def of(settings: Config, training: TrainingSession) -> "Leaves":
         names = [layout.agents[i] for i in group.members]
         wanted = template.groups[g]
         if group.frozen:
-            groups.append(_frozen(settings, algo, layout, group.members, wanted, seeds))
+            groups.append(_frozen(settings, algo, layout, group.members, wanted, seeds, env))
         elif init is not None:
             members = []
             for name, number in zip(names, group.members, strict=True):
@@ -156,11 +171,11 @@ def of(settings: Config, training: TrainingSession) -> "Leaves":
 
 def _frozen(
     settings: Config, algo: AlgoConfig, layout: JointLayout, members: Sequence[int], wanted: GroupState,
-    seeds: Sequence[int],
+    seeds: Sequence[int], env: Environment,
 ) -> GroupState:  # fmt: skip
     """The policies of a frozen group."""
     key = "algo.policy" if algo is settings.algo else "adversary.policy"
-    source = Source(key, str(algo.policy), algo.policy_checkpoint, seeds, algo.policy_seed)
+    source = Source(key, str(algo.policy), algo.policy_checkpoint, seeds, algo.policy_seed, env)
     found = []
     for number in members:
         name = layout.agents[number]

@@ -182,3 +182,10 @@ def join_spaces(spaces: tuple[ActionSpace, ...]) -> ActionSpace:
     ):
         return Box(sum(space.size for space in spaces), first.low, first.high)
     raise OptionError(f"cannot join the action spaces {', '.join(map(str, spaces))}: kinds or bounds differ")
+
+
+def innermost(env: Environment) -> Environment:
+    """An environment as it was before its teams were joined."""
+    while isinstance(env, JointTeam):
+        env = env.env
+    return env
