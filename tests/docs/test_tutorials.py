@@ -26,7 +26,7 @@ TINY = "learning_starts=400 batch_size=16 'algo.hidden=[8]' eval_episodes=2"
 SHORTER = {
     "first_run": [("total_steps=100000", f"total_steps=1000 {TINY}"), ("total_steps=150000", "total_steps=1200")],
     "own_environment": [
-        ("total_steps=20_000, learning_starts=2_000", "total_steps=1_500, learning_starts=500"),
+        ("total_steps=40_000, learning_starts=2_000", "total_steps=1_500, learning_starts=500"),
         ("episodes=100", "episodes=2"),
     ],
     "own_algorithm": [("total_steps=20000 learning_starts=2000 batch_size=128", f"total_steps=1000 {TINY}")],
