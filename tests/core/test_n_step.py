@@ -125,7 +125,7 @@ def test_updates_get_them(monkeypatch):
 
     monkeypatch.setattr(update, "update", stub)
     trainer, state, played = play(5)
-    trainer.schedule = dataclasses.replace(SCHEDULE, batch_size=20_000)
+    trainer.schedule = trainer.learner.schedule = dataclasses.replace(SCHEDULE, batch_size=20_000)
     state, metrics = trainer.interval(1)(jax.tree.map(jnp.copy, state))
     new = np.asarray(state.replay[:, : SCHEDULE.rollout_steps]).reshape(2, LENGTH, ENVS, -1)
     played = np.concatenate([played[:, -CAPACITY // ENVS + LENGTH :], new], axis=1)
