@@ -44,7 +44,7 @@ SCALES = {
     "paper": ["seeds=10", "total_steps=1500000", "log_every=12500"],
     "small": ["seeds=5", "total_steps=250000", "log_every=5000"],
 }
-KEYS = {"algo": "algo.name", "step": "algo.adversarial_step"}
+KEYS = {"algo": "algo.name", "adversarial_step": "algo.adversarial_step"}
 
 
 @dataclasses.dataclass(frozen=True)
