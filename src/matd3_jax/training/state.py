@@ -98,7 +98,9 @@ def networks_finite(state: TrainState) -> chex.Array:
     return _finite(state.groups)
 
 
-@jax.jit
-def _finite(groups: chex.ArrayTree) -> chex.Array:
-    each = [jnp.isfinite(leaf).reshape(leaf.shape[0], -1).all(axis=1) for leaf in jax.tree.leaves(groups)]
-    return jnp.stack(each).all(axis=0)
+def all_finite(tree: chex.ArrayTree) -> chex.Array:
+    """Whether all numbers of a tree are finite, a scalar."""
+    return jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree)]).all()
+
+
+_finite = jax.jit(jax.vmap(all_finite))

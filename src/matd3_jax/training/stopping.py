@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from matd3_jax.core.rollout import Episodes
 from matd3_jax.core.update import UpdateMetrics
 from matd3_jax.training.sharding import unstack
-from matd3_jax.training.state import TrainState
+from matd3_jax.training.state import TrainState, all_finite, networks_finite
 
 
 def stop_diverged(before: TrainState, after: TrainState, episodes: Episodes, metrics: UpdateMetrics) -> TrainState:
@@ -26,23 +26,18 @@ def stop_diverged(before: TrainState, after: TrainState, episodes: Episodes, met
     sound = jnp.stack([_all(leaf) for leaf in finite]).all(axis=0)
     groups: list | tuple
     if isinstance(after.groups, list):
-        networks = jnp.stack([_networks(each) for each in after.groups])
+        networks = jnp.stack([all_finite(each) for each in after.groups])
         stopped = before.stopped | ~(sound & networks)  # type: ignore[operator]
         each = unstack(stopped, len(after.groups))
         groups = [_choose(*pair) for pair in zip(each, before.groups, after.groups, strict=True)]
     else:
-        stopped = before.stopped | ~(sound & jax.vmap(_networks)(after.groups))  # type: ignore[operator]
+        stopped = before.stopped | ~(sound & networks_finite(after))  # type: ignore[operator]
         groups = jax.vmap(_choose)(stopped, before.groups, after.groups)
     return after._replace(groups=groups, stopped=stopped)  # type: ignore[arg-type]
 
 
 def _all(finite: chex.Array) -> chex.Array:
     return finite.reshape(finite.shape[0], -1).all(axis=1)
-
-
-def _networks(groups: chex.ArrayTree) -> chex.Array:
-    """Whether all numbers of one seed's networks and optimizers are finite."""
-    return jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(groups)]).all()
 
 
 def _choose(stopped: chex.Array, before: chex.ArrayTree, after: chex.ArrayTree) -> chex.ArrayTree:
