@@ -121,26 +121,28 @@ def _update(trainer: TrainLoop, group: Group) -> Iterator[tuple[Product, float]]
         yield from ((part, 1 / shared) for part in _forward(members, batch, sizes))
     critic = (update.critic_input_size(layout, group), *hidden, group.critic.num_outputs)
     twins = algorithm.num_critics
-    forward = [*_wide(twins, batch, critic), *_forward((twins,), batch, critic)[1:]]
-    yield from ((part, 2) for part in forward)  # targets, and the critics themselves
+    targets, climbed = algorithm.target_critics or twins, 1 if algorithm.actor_critics == "first" else twins
+    every, target, first = (_first_to_last(number, batch, critic) for number in (twins, targets, climbed))
+    yield from ((part, 1) for part in target + every)
     yield Product("bi,bo->io", (batch, critic[0]), (batch, twins * critic[1])), 1
     yield from ((part, 1) for part in _backward((twins,), batch, critic)[1:])
     if algorithm.adversarial:
-        # The slopes by which others' actions are moved: of all target critics, and of the first critic.
-        yield from ((part, 1) for part in [*forward, *_back_to_inputs(twins, batch, critic)])
-        first = _forward((1,), batch, critic)
-        first = first if critic[-1] > 1 else first[:-1]  # the slope of one scalar needs no value
-        yield from ((part, 1 / delay) for part in first + _back_to_inputs(1, batch, critic))
+        # The slopes by which others' actions are moved: of the target's critics, and of those that the actor climbs.
+        yield from ((part, 1) for part in [*target, *_back_to_inputs(targets, batch, critic)])
+        values = algorithm.critic_head == "categorical"  # elsewhere the slope of a mean needs no outputs
+        yield from ((part, 1 / delay) for part in (first if values else first[:-1]))
+        yield from ((part, 1 / delay) for part in _back_to_inputs(climbed, batch, critic))
     for other in layout.learning_groups if trainer.schedule.random_order and central else ():
         # What everybody does by now, before each actor moves.
         sizes = (other.observation_size, *other.algorithm.hidden, other.action_space.size)
         yield from ((part, 1 / delay) for part in _forward((len(other.members),), batch, sizes))
     k = group.action_space.size
     actor = (group.observation_size, *hidden, k)
-    yield from ((part, 1 / delay) for part in _forward((), batch, actor) + _forward((1,), batch, critic))
-    yield Product("bi,io->bo", (batch, k), (k, critic[1])), 1 / delay  # the own action's change
-    yield Product("bo,io->bi", (batch, critic[1]), (k, critic[1])), 1 / delay
-    yield from ((part, 1 / delay) for part in _backward((1,), batch, critic)[1:] if part.equation.endswith("bi"))
+    width = climbed * critic[1]
+    yield from ((part, 1 / delay) for part in _forward((), batch, actor) + first)
+    yield Product("bi,io->bo", (batch, k), (k, width)), 1 / delay  # the own action's change
+    yield Product("bo,io->bi", (batch, width), (k, width)), 1 / delay
+    yield from ((part, 1 / delay) for part in _backward((climbed,), batch, critic)[1:] if part.equation.endswith("bi"))
     yield from ((part, 1 / delay) for part in _backward((), batch, actor))
 
 
@@ -153,9 +155,10 @@ def _forward(stack: tuple[int, ...], batch: int, sizes: Sequence[int]) -> list[P
     ]
 
 
-def _wide(stack: int, batch: int, sizes: Sequence[int]) -> list[Product]:
-    """The first layers of a stack that reads the same input: one wide product."""
-    return [Product("bi,io->bo", (batch, sizes[0]), (sizes[0], stack * sizes[1]))]
+def _first_to_last(stack: int, batch: int, sizes: Sequence[int]) -> list[Product]:
+    """The layers of a stack that reads the same input: the first ones are one wide product."""
+    wide = Product("bi,io->bo", (batch, sizes[0]), (sizes[0], stack * sizes[1]))
+    return [wide, *_forward((stack,), batch, sizes)[1:]]
 
 
 def _backward(stack: tuple[int, ...], batch: int, sizes: Sequence[int]) -> list[Product]:

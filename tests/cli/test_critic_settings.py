@@ -18,13 +18,24 @@ TINY = [
     "num_envs=2", "learning_starts=200", "replay_capacity=500", "total_steps=600", "log_every=100", "eval_every=300",
     "eval_episodes=2",
 ]  # fmt: skip
+QUANTILES = [
+    "adversary.critic_head=quantile", "adversary.critic_quantiles=5", "adversary.num_critics=3",
+    "adversary.target_critics=2", "adversary.actor_critics=all",
+]  # fmt: skip
 DISTRIBUTION = ["algo.critic_range=[-60,5]", "algo.critic_atoms=9", "adversary.critic_norm=layer"]
 
 
 @pytest.mark.slow
 def test_resumed_to_the_bit(tmp_path):
-    """A categorical team against one with layer normalization, Q-bias measured on the way."""
-    line = [*TINY, *DISTRIBUTION, "algo.critic_head=categorical", "diagnostics.q_bias=true", f"out={tmp_path}"]
+    """A categorical team against one with quantiles and layer normalization, Q-bias measured on the way."""
+    line = [
+        *TINY,
+        *DISTRIBUTION,
+        *QUANTILES,
+        "algo.critic_head=categorical",
+        "diagnostics.q_bias=true",
+        f"out={tmp_path}",
+    ]
     assert train.main([*line, "name=whole", "checkpoint_every=300", "keep_checkpoints=3"]) == 0
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     shutil.copytree(whole, cut)

@@ -183,7 +183,11 @@ MISTAKES = {
     "algo.clip=global": "variable, network, none",
     "algo.critic=joint": "central, own",
     "algo.critic_norm=batch": "none, layer",
-    "algo.critic_head=quantile": "scalar, categorical",
+    "algo.critic_head=gaussian": "scalar, categorical, quantile",
+    "algo.target_critics=3": "algo.num_critics=2",
+    "algo.target_critics=0": "at least 1",
+    "algo.actor_critics=min": "first, all",
+    "algo.dropped_quantiles=-1": "must not be negative",
     "algo.critic_head=categorical": "algo.critic_range=[low,high]",
     "algo.critic_range=[5,5]": "below the second",
     "algo.critic_range=[0,inf]": "finite",
@@ -216,6 +220,13 @@ def test_every_mistake_gives_one_line_that_names_it(text):
         config.load([text])
     assert MISTAKES[text] in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_target_needs_some_quantiles():
+    settings = ["algo.critic_head=quantile", "algo.dropped_quantiles=25"]
+    with pytest.raises(UserError, match=r"^algo\.dropped_quantiles=25 leaves none of algo\.critic_quantiles=25$"):
+        config.load(settings)
+    assert config.load([*settings, "algo.critic_quantiles=26"]).algo.dropped_quantiles == 25
 
 
 @pytest.mark.parametrize("key", ["adversarial_step", "adversarial_step_team"])

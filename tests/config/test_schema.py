@@ -28,6 +28,10 @@ OTHER = {  # another value of each setting of an algorithm
     "critic_head": "categorical",
     "critic_atoms": 11,
     "critic_range": (-1.0, 2.0),
+    "target_critics": 1,
+    "actor_critics": "all",
+    "critic_quantiles": 9,
+    "dropped_quantiles": 3,
 }
 
 

@@ -10,7 +10,7 @@ import pytest
 import reference
 from learner_cases import BATCH, CASES, agents_of, drawn, numbers, random_rows, random_state
 
-from matd3_jax.core import networks, sequential_actors, update
+from matd3_jax.core import minibatch, networks, sequential_actors, update
 from matd3_jax.core.policies import CategoricalPolicy, DeterministicPolicy
 
 KEY = jax.random.key(0)
@@ -71,7 +71,7 @@ class Program:
         with jax.enable_x64(True):
             return random_state(self.layout, rng), random_rows(self.layout, rng, self.batches)
 
-    def reference(self, state, rows, sequential=None, alter=lambda agent: None, order="drawn"):
+    def reference(self, state, rows, sequential=None, alter=lambda agent: None, order="drawn", chosen="drawn"):
         agents = agents_of(self.layout, state, self.hyper)
         for agent in agents:
             alter(agent)
@@ -83,7 +83,18 @@ class Program:
             move=[self.layout.teams[i] not in self.case.still for i in range(len(agents))],
             sequential=self.case.sequential if sequential is None else sequential,
             order=self.order() if order == "drawn" else order,
+            chosen=self.chosen() if chosen == "drawn" else chosen,
         )
+
+    def chosen(self):
+        """Of each agent, the numbers of the critics that make its target."""
+        found = [None] * self.layout.num_agents
+        keys = jax.random.split(KEY, len(self.layout.groups))
+        for group, key in zip(self.layout.groups, keys, strict=True):
+            drawn = minibatch.draw_noise(self.layout, group, (self.batches, BATCH), key, None).critics
+            for k, i in enumerate(group.members):
+                found[i] = None if drawn is None else drawn[k].tolist()
+        return found
 
     def order(self):
         """Of the actors that move, where they move in random order."""
@@ -175,6 +186,10 @@ def test_some_norms_are_clipped_and_some_are_not():
         ("random-order", "order", lambda order: None),
         ("random-order-interleaved", "order", lambda order: order[::-1]),
         ("categorical", "algorithm.critic_range", (-2.0, 1.6)),
+        ("quantile", "algorithm.dropped_quantiles", 1),
+        ("quantile-m3matd3", "algorithm.actor_critics", "first"),
+        ("subset", "chosen", lambda chosen: chosen[::-1]),
+        ("subset", "chosen", lambda chosen: None),
         ("m3ddpg", "hyper.adversarial_step", 0.5999),
         ("m3matd3-box", "hyper.adversarial_step_team", 0.2499),
         ("m3matd3-interleaved", "algorithm.adversarial", False),
@@ -201,7 +216,8 @@ def test_reference_distinguishes(name, field, value):
     else:
         sequential = value if field == "sequential" else None
         order = p.order() and value(p.order()) if field == "order" else "drawn"
-        wrong, _, _ = p.reference(state, rows, sequential=sequential, alter=alter, order=order)
+        chosen = value(p.chosen()) if field == "chosen" else "drawn"
+        wrong, _, _ = p.reference(state, rows, sequential=sequential, alter=alter, order=order, chosen=chosen)
     gaps = [
         np.abs(np.asarray(a) - b).max()
         for one, other in zip(map(numbers, right), map(numbers, wrong), strict=True)
@@ -304,6 +320,31 @@ def test_twin_critics_see_the_same_action():
     for s in new:
         for leaf in jax.tree.leaves((s.critic, s.critic_target)):
             np.testing.assert_array_equal(leaf[:, 0], leaf[:, 1])
+
+
+def test_a_target_s_critics_are_drawn_for_each_agent_and_update():
+    """Every pair of four critics as often as any other, none twice, independently for the agents."""
+    layout, updates = CASES["subset"].layout(), 3000
+    (group,) = layout.groups
+    keys = jax.random.split(jax.random.key(7), updates)
+    drawn = jax.jit(jax.vmap(lambda key: minibatch.draw_noise(layout, group, (1, 2), key, None).critics))(keys)
+    pairs = np.sort(drawn, axis=-1)  # [updates, agents, 2]
+    assert (pairs[..., 0] < pairs[..., 1]).all()
+    code = 4 * pairs[..., 0] + pairs[..., 1]
+    for agent in range(layout.num_agents):
+        _, counts = np.unique(code[:, agent], return_counts=True)
+        # Of 3000 draws each pair gets 500 with a deviation of 20.
+        assert len(counts) == 6 and np.abs(counts - updates / 6).max() < 100
+        other = code[:, (agent + 1) % layout.num_agents]
+        assert abs(np.mean(code[:, agent] == other) - 1 / 6) < 0.04
+
+
+def test_a_target_of_all_critics_in_any_order_is_that_of_all():
+    p = Program(dataclasses.replace(CASES["box"], changes={**CASES["box"].changes, "target_critics": 3}))
+    _, state, rows, new, metrics = base("box")
+    found, losses = p(state, rows)
+    close = functools.partial(np.testing.assert_allclose, rtol=TOLERANCE, atol=TOLERANCE)  # sums in another order
+    jax.tree.map(close, (found, losses), (new, metrics))
 
 
 def test_draws_have_their_own_keys(monkeypatch):

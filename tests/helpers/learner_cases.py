@@ -97,6 +97,10 @@ def interleaved(algorithm) -> JointLayout:
 DISTRIBUTION: Mapping = {"critic_head": "categorical", "critic_atoms": 7, "critic_range": (-2.0, 1.5)}
 """So narrow that some returns are moved beyond both ends."""
 
+QUANTILES: Mapping = {"critic_head": "quantile", "critic_quantiles": 5, "dropped_quantiles": 2}
+
+SUBSET: Mapping = {"num_critics": 4, "target_critics": 2, "actor_critics": "all"}
+
 ADVERSARIAL: Mapping = {"adversarial_step": 0.6, "adversarial_step_team": 0.25}
 """So long that some actions are moved out of a Box."""
 
@@ -162,6 +166,12 @@ CASES = {
     "categorical-layer-norm": Case(
         "point_reach", "matd3", changes=DISTRIBUTION | {"critic_norm": "layer", "clip": "none"}, sequential=True
     ),
+    "quantile": Case("simple_spread", "matd3", changes=QUANTILES, one_by_one=False),
+    "quantile-subset": Case("simple_tag", "matd3", "iltd3", changes=QUANTILES | SUBSET, n_step=2),
+    "quantile-m3matd3": Case("point_reach", "m3matd3", changes=QUANTILES | {"actor_critics": "all"}, shared=True),
+    "subset": Case("simple_spread", "matd3", changes=SUBSET | {"actor_critics": "first"}),
+    "subset-shared": Case("interleaved", "matd3", changes=SUBSET | {"critic_norm": "layer"}, shared=True),
+    "subset-m3matd3": Case("simple_push", "m3matd3", changes=SUBSET, one_by_one=False, random_order=True),
     # Others' actions moved against each agent.
     "m3ddpg": Case("simple_tag", "m3ddpg", changes={"hidden": (6, 5)}),
     "m3matd3": Case("simple_adversary", "m3matd3", "m3ddpg", n_step=2),

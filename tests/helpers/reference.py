@@ -63,13 +63,20 @@ class Scalar:
         """From the outputs of all target critics."""
         return reward + discount * np.min([output[:, 0] for output in outputs], axis=0)
 
+    def target_slopes(self, outputs):
+        """Of what the target takes, with respect to the outputs of each critic: that of the smaller value, row by
+        row."""
+        values, slopes = zip(*map(self.value, outputs), strict=True)
+        smallest = np.argmin(values, axis=0)
+        return [np.where((smallest == c)[:, None], slope, 0) for c, slope in enumerate(slopes)]
+
     def loss(self, output, target):
         """(mean loss, its slope with respect to the outputs)."""
         error = output[:, 0] - target
         return (error**2).mean(), 2 * error[:, None] / len(error)
 
 
-class Categorical:
+class Categorical(Scalar):
     """Outputs [batch, atoms]: logits of a distribution of returns (Bellemare et al. 2017, algorithm 1)."""
 
     def __init__(self, algorithm):
@@ -101,8 +108,48 @@ class Categorical:
         return -(target * np.log(p)).sum(axis=1).mean(), (p - target) / len(p)
 
 
+class Quantile(Scalar):
+    """Outputs [batch, quantiles]: quantiles of the return (Kuznetsov et al. 2020, equations 7 to 11)."""
+
+    def __init__(self, algorithm):
+        self.count = algorithm.critic_quantiles
+        self.left = self.count - algorithm.dropped_quantiles
+
+    def value(self, output):
+        return output.sum(axis=1) / self.count, np.full_like(output, 1 / self.count)
+
+    def places(self, outputs, b):
+        """(critic, quantile) of the quantiles that row b keeps, from the smallest on."""
+        every = [(c, k) for c in range(len(outputs)) for k in range(self.count)]
+        return sorted(every, key=lambda place: outputs[place[0]][b, place[1]])[: len(outputs) * self.left]
+
+    def target(self, outputs, reward, discount):
+        rows = range(len(reward))
+        kept = [[outputs[c][b, k] for c, k in self.places(outputs, b)] for b in rows]
+        return np.array([reward[b] + discount[b] * np.array(kept[b]) for b in rows])
+
+    def target_slopes(self, outputs):
+        slopes = [np.zeros_like(output) for output in outputs]
+        for b in range(len(outputs[0])):
+            for c, k in self.places(outputs, b):
+                slopes[c][b, k] = 1 / (len(outputs) * self.left)
+        return slopes
+
+    def loss(self, output, target):
+        total, slope = 0.0, np.zeros_like(output)
+        terms = output.size * target.shape[1]
+        for (b, k), theta in np.ndenumerate(output):
+            level = (2 * k + 1) / (2 * self.count)
+            for y in target[b]:
+                error = y - theta
+                weight = level if error >= 0 else 1 - level
+                total += weight * (error**2 / 2 if abs(error) <= 1 else abs(error) - 1 / 2) / terms
+                slope[b, k] -= weight * max(-1, min(1, error)) / terms
+        return total, slope
+
+
 def head(algorithm):
-    return {"scalar": Scalar, "categorical": Categorical}[algorithm.critic_head](algorithm)
+    return {"scalar": Scalar, "categorical": Categorical, "quantile": Quantile}[algorithm.critic_head](algorithm)
 
 
 # ---- actions ---------------------------------------------------------------------------------------------------------
@@ -287,7 +334,7 @@ def long_step(rows, agents, gamma):
     return np.delete(long, goes_on, axis=1)
 
 
-def update(agents, batches, gumbel, normal, move, sequential, order=None):
+def update(agents, batches, gumbel, normal, move, sequential, order=None, chosen=None):
     """One update. Returns (agents after it, metrics [3, agents], number of clipped norms).
 
     Args:
@@ -307,6 +354,9 @@ def update(agents, batches, gumbel, normal, move, sequential, order=None):
             rows = long_step(rows, agents, h.gamma)
         x, a, r, next_x, discount = take_apart(rows, agents)
         central, critic = algorithm.critic == "central", head(algorithm)
+        targets = agent.critic_targets
+        if chosen is not None and chosen[i] is not None:
+            targets = [targets[c] for c in chosen[i]]
 
         # Target: r + gamma min_j Q'_j(x', mu'(o')), bootstrapping unless terminated.
         next_a = []
@@ -320,20 +370,18 @@ def update(agents, batches, gumbel, normal, move, sequential, order=None):
         alphas = [h.adversarial_step_team if other.team == agent.team else h.adversarial_step for other in agents]
         if algorithm.adversarial:
 
-            def slope_of_least(read, agent=agent, critic=critic):
-                """Of min_j Q'_j: row by row that of the critic with the smaller value."""
-                passes = [forward(target, read) for target in agent.critic_targets]
-                values = [critic.value(output) for output, _ in passes]
-                slopes = [
+            def slope_of_least(read, targets=targets, critic=critic):
+                """Of min_j Q'_j, or what the target takes in its place."""
+                passes = [forward(target, read) for target in targets]
+                slopes = critic.target_slopes([output for output, _ in passes])
+                return sum(
                     backward(target, kept, slope)[1]
-                    for target, (_, kept), (_, slope) in zip(agent.critic_targets, passes, values, strict=True)
-                ]
-                smallest = np.argmin([value for value, _ in values], axis=0)
-                return np.array([slopes[c][b] for b, c in enumerate(smallest)])
+                    for target, (_, kept), slope in zip(targets, passes, slopes, strict=True)
+                )
 
             next_a = worst_case(agents, i, next_x, next_a, slope_of_least, alphas)
         read = np.concatenate([*next_x, *next_a] if central else [next_x[i], next_a[i]], axis=1)
-        outputs = [forward(target, read)[0] for target in agent.critic_targets]
+        outputs = [forward(target, read)[0] for target in targets]
         y = critic.target(outputs, algorithm.reward_scale * r[i], h.gamma * discount)
 
         # Critics: mean squared error or cross-entropy, each with its own optimizer.
@@ -376,21 +424,27 @@ def move_actor(agents, i, x, a, gumbel, alphas):
     agent = agents[i]
     h, algorithm, batch, critic = agent.hyper, agent.algorithm, len(x[0]), head(agent.algorithm)
     central = algorithm.critic == "central"
-    # Climbs the first critic (as it now is) with its own action drawn again.
+    # Climbs the first critic (as it now is), or the mean of all, with its own action drawn again.
+    climbed = agent.critics if algorithm.actor_critics == "all" else agent.critics[:1]
+
+    def value(read):
+        """(mean value, its slope with respect to the critics' inputs)."""
+        total, slopes = 0, 0
+        for layers in climbed:
+            output, kept = forward(layers, read)
+            q, slope = critic.value(output)
+            total = total + q / len(climbed)
+            slopes = slopes + backward(layers, kept, slope / len(climbed))[1]
+        return total, slopes
+
     output, kept = forward(agent.actor, x[i])
     own, kept_act = act(agent.space, output, gumbel(agent.space.size), algorithm.actor_output)
     mixed = [own if j == i else a[j] for j in range(len(agents))]
     if algorithm.adversarial:
-
-        def slope_of_first(read):
-            output, kept = forward(agent.critics[0], read)
-            return backward(agent.critics[0], kept, critic.value(output)[1])[1]
-
-        mixed = worst_case(agents, i, x, mixed, slope_of_first, alphas)
-    q, kept_q = forward(agent.critics[0], np.concatenate([*x, *mixed] if central else [x[i], own], axis=1))
-    q, slope = critic.value(q)
+        mixed = worst_case(agents, i, x, mixed, lambda read: value(read)[1], alphas)
+    q, slope = value(np.concatenate([*x, *mixed] if central else [x[i], own], axis=1))
     loss = -q.mean() + h.logit_regularizer * (output**2).mean()
-    _, slope = backward(agent.critics[0], kept_q, -slope / batch)
+    slope = -slope / batch
     start = sum(o.shape[1] for o in x) + sum(o.shape[1] for o in a[:i]) if central else x[i].shape[1]
     slope = act_slope(agent.space, kept_act, slope[:, start : start + agent.space.size])
     slope = slope + h.logit_regularizer * 2 * output / output.size

@@ -34,6 +34,8 @@ def training(*settings, **options):
         (*ANT, "env.split=halves"),
         ("env=ant", "env.split=4x2", *WIDE),
         (*ANT, "algo=td3"),
+        ("env=simple_spread", "algo.num_critics=5", "algo.target_critics=2", "algo.actor_critics=all"),
+        ("env=simple_tag", "algo=m3matd3", "algo.critic_head=quantile", "algo.num_critics=3", "algo.actor_critics=all"),
         (*ANT, "algo.critic_head=categorical", "algo.critic_range=[-50,500]", "algo.critic_atoms=21"),
         ("env=hopper", "env.split=[[thigh_joint],[leg_joint],[foot_joint]]", *WIDE, "algo.policy_delay=4"),
     ],

@@ -31,6 +31,10 @@ ALGORITHMS = {
     "matd3-categorical": Algorithm(
         hidden=(16,), clip="none", critic_head="categorical", critic_atoms=49, critic_range=(-6.0, 6.0)
     ),
+    "matd3-quantile": Algorithm(
+        hidden=(16,), clip="none", critic_head="quantile", critic_quantiles=9, dropped_quantiles=0, actor_critics="all"
+    ),
+    "matd3-subset": Algorithm(hidden=(16,), clip="none", num_critics=4, target_critics=2, actor_critics="all"),
 }
 HYPER = HYPER._replace(
     gamma=GAMMA,

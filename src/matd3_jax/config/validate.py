@@ -116,6 +116,15 @@ def _check_team(name: str, team: "AlgoConfig", updates: int, need: Any) -> None:
         team.critic_head != "categorical" or team.critic_range is not None,
         f"{name}.critic_head=categorical needs the range of returns: {name}.critic_range=[low,high]",
     )
+    need(
+        team.target_critics is None or team.target_critics <= team.num_critics,
+        f"{name}.target_critics={team.target_critics} is more than {name}.num_critics={team.num_critics}",
+    )
+    need(
+        team.critic_head != "quantile" or team.dropped_quantiles < team.critic_quantiles,
+        f"{name}.dropped_quantiles={team.dropped_quantiles} leaves none of {name}.critic_quantiles="
+        f"{team.critic_quantiles}",
+    )
     if team.critic_range is not None:
         first, last = team.critic_range
         need(first < last, f"{name}.critic_range=[{first},{last}]: the first number must be below the second")

@@ -51,6 +51,11 @@ class Group:
         """The critics of one member."""
         return critics.of(self.algorithm)
 
+    @property
+    def target_critic(self) -> Critic:
+        """Those of one member that make a target."""
+        return critics.of_target(self.algorithm)
+
 
 @dataclasses.dataclass(frozen=True)
 class JointLayout:

@@ -17,14 +17,22 @@ class Algorithm:
     """"central": the critics see the joint observation and all actions; "own": the agent's own parts only."""
     num_critics: int = 2
     """The target takes the minimum over that many target critics; the actor climbs the first."""
+    target_critics: int | None = None
+    """Each target is made of so many critics, drawn at random for every agent and update (REDQ); None: of all."""
+    actor_critics: Literal["first", "all"] = "first"
+    """The actor climbs the first critic's value, or the mean of all critics' (REDQ, TQC)."""
     critic_norm: Literal["none", "layer"] = "none"
     """"layer": layer normalization before each ReLU of the critics."""
-    critic_head: Literal["scalar", "categorical"] = "scalar"
-    """What a critic gives: a number, or a distribution over atoms (C51)."""
+    critic_head: Literal["scalar", "categorical", "quantile"] = "scalar"
+    """What a critic gives: a number, a distribution over atoms (C51), or quantiles (TQC)."""
     critic_atoms: int = 51
     """Atoms of the categorical head."""
     critic_range: tuple[float, float] | None = None
     """Returns at the first and last atom, in units of the scaled rewards; needed by the categorical head."""
+    critic_quantiles: int = 25
+    """Of the quantile head."""
+    dropped_quantiles: int = 2
+    """The target leaves out so many for each of its critics, the largest of all critics' together."""
     policy_delay: int = 2
     """Actor and targets move with every policy_delay-th update (d in the paper)."""
     hidden: tuple[int, ...] = (64, 64)

@@ -29,6 +29,9 @@ class Critic(Protocol):
     ) -> chex.Array:
         """r + discount * min_j Q'_ij(next inputs), leading axis [batch]; reward, discount: [batch]."""
 
+    def target_value(self, params: chex.ArrayTree, inputs: chex.Array) -> chex.Array:
+        """min_j Q'_ij [batch], or what else `target` has in its place."""
+
     @property
     def num_outputs(self) -> int:
         """Width of each critic's last layer, for those who count operations and bytes."""
@@ -39,17 +42,25 @@ class Critic(Protocol):
     def value(
         self, params: chex.ArrayTree, inputs: chex.Array, change: chex.Array, column: chex.Array | int
     ) -> chex.Array:
-        """Q_i1 [batch] of the inputs with `change` [batch, k] added to the columns from `column` on: what the actor
-        climbs. A gradient with respect to `change` costs k columns instead of all."""
+        """What the actor climbs, Q_i1 [batch] or the mean over the critics, of the inputs with `change` [batch, k]
+        added to the columns from `column` on. A gradient with respect to `change` costs k columns instead of all."""
 
 
 def of(algorithm: Algorithm) -> Critic:
     """The critics of an algorithm's agents."""
-    network = (algorithm.num_critics, algorithm.hidden, algorithm.critic_norm == "layer")
+    climbed = 1 if algorithm.actor_critics == "first" else algorithm.num_critics
+    network = (algorithm.num_critics, algorithm.hidden, algorithm.critic_norm == "layer", climbed)
     if algorithm.critic_head == "scalar":
         return ScalarCritic(*network)
+    if algorithm.critic_head == "quantile":
+        return QuantileCritic(*network, algorithm.critic_quantiles, algorithm.dropped_quantiles)
     assert algorithm.critic_range is not None
     return CategoricalCritic(*network, algorithm.critic_atoms, algorithm.critic_range)
+
+
+def of_target(algorithm: Algorithm) -> Critic:
+    """The critics that make a target: all of them, or as many as are drawn for it."""
+    return of(dataclasses.replace(algorithm, num_critics=algorithm.target_critics or algorithm.num_critics))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,10 +70,16 @@ class _Perceptrons:
     num_critics: int
     hidden: tuple[int, ...]
     layer_norm: bool
+    climbed: int
+    """So many of the critics, the first ones, are what the actor climbs."""
 
     @property
     def num_outputs(self) -> int:
         return 1
+
+    def read(self, outputs: chex.Array) -> chex.Array:
+        """Values [...] of outputs [..., num_outputs]."""
+        return outputs[..., 0]
 
     def network(self, critics: int) -> StackedMLP:
         """So many critics as one network: inputs [batch, inputs] to outputs [critics, batch, num_outputs]."""
@@ -75,34 +92,32 @@ class _Perceptrons:
         """[critics, batch, num_outputs]."""
         return apply(self.network(self.num_critics), params, inputs)
 
-    def first_output(
+    def values(self, params: chex.ArrayTree, inputs: chex.Array) -> chex.Array:
+        return self.read(self.outputs(params, inputs))
+
+    def target_value(self, params: chex.ArrayTree, inputs: chex.Array) -> chex.Array:
+        return self.values(params, inputs).min(axis=0)
+
+    def value(
         self, params: chex.ArrayTree, inputs: chex.Array, change: chex.Array, column: chex.Array | int
     ) -> chex.Array:
-        """Outputs [batch, num_outputs] of the first critic, its inputs changed as `Critic.value` has it."""
-        first: Any = jax.tree.map(lambda p: p[:1], params)
-        return apply(self.network(1), first, inputs, change, column)[0]
+        some: Any = jax.tree.map(lambda p: p[: self.climbed], params)
+        outputs = apply(self.network(self.climbed), some, inputs, change, column)
+        return self.read(outputs[0]) if self.climbed == 1 else self.read(outputs).mean(axis=0)
 
 
 @dataclasses.dataclass(frozen=True)
 class ScalarCritic(_Perceptrons):
     """Critics that give one number each; a mean squared error."""
 
-    def values(self, params: chex.ArrayTree, inputs: chex.Array) -> chex.Array:
-        return self.outputs(params, inputs)[..., 0]
-
     def target(
         self, params: chex.ArrayTree, reward: chex.Array, discount: chex.Array, next_inputs: chex.Array
     ) -> chex.Array:
-        return reward + discount * self.values(params, next_inputs).min(axis=0)
+        return reward + discount * self.target_value(params, next_inputs)
 
     def loss(self, params: chex.ArrayTree, inputs: chex.Array, target: chex.Array) -> tuple[chex.Array, chex.Array]:
         q = self.values(params, inputs)
         return jnp.mean(jnp.square(q - target), axis=-1), q[0]
-
-    def value(
-        self, params: chex.ArrayTree, inputs: chex.Array, change: chex.Array, column: chex.Array | int
-    ) -> chex.Array:
-        return self.first_output(params, inputs, change, column)[:, 0]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,8 +145,8 @@ class CategoricalCritic(_Perceptrons):
         """Expected returns [...] of distributions [..., atoms]."""
         return (probabilities * self.returns).sum(axis=-1)
 
-    def values(self, params: chex.ArrayTree, inputs: chex.Array) -> chex.Array:
-        return self.mean(jax.nn.softmax(self.outputs(params, inputs)))
+    def read(self, outputs: chex.Array) -> chex.Array:
+        return self.mean(jax.nn.softmax(outputs))
 
     def target(
         self, params: chex.ArrayTree, reward: chex.Array, discount: chex.Array, next_inputs: chex.Array
@@ -153,7 +168,47 @@ class CategoricalCritic(_Perceptrons):
         logs = jax.nn.log_softmax(self.outputs(params, inputs))
         return -(target * logs).sum(axis=-1).mean(axis=-1), self.mean(jnp.exp(logs[0]))
 
-    def value(
-        self, params: chex.ArrayTree, inputs: chex.Array, change: chex.Array, column: chex.Array | int
+
+@dataclasses.dataclass(frozen=True)
+class QuantileCritic(_Perceptrons):
+    """Critics that give quantiles of the return; the target leaves the largest of all critics' out (TQC, Kuznetsov et
+    al. 2020).
+
+    The value is the quantiles' mean. The loss is the quantile regression's, Huber's with threshold 1.
+    """
+
+    quantiles: int
+    dropped: int
+    """Of each target critic's quantiles; those of all critics are sorted together before."""
+
+    @property
+    def num_outputs(self) -> int:
+        return self.quantiles
+
+    def read(self, outputs: chex.Array) -> chex.Array:
+        return outputs.mean(axis=-1)
+
+    def kept(self, params: chex.ArrayTree, inputs: chex.Array) -> chex.Array:
+        """The smaller quantiles of all critics together, [batch, critics * (quantiles - dropped)], in rising order."""
+        outputs = jnp.moveaxis(self.outputs(params, inputs), 0, 1)
+        every = jnp.sort(outputs.reshape(outputs.shape[0], -1), axis=-1)
+        return every[:, : self.num_critics * (self.quantiles - self.dropped)]
+
+    def target(
+        self, params: chex.ArrayTree, reward: chex.Array, discount: chex.Array, next_inputs: chex.Array
     ) -> chex.Array:
-        return self.mean(jax.nn.softmax(self.first_output(params, inputs, change, column)))
+        return reward[:, None] + discount[:, None] * self.kept(params, next_inputs)
+
+    def target_value(self, params: chex.ArrayTree, inputs: chex.Array) -> chex.Array:
+        return self.kept(params, inputs).mean(axis=-1)
+
+    def loss(self, params: chex.ArrayTree, inputs: chex.Array, target: chex.Array) -> tuple[chex.Array, chex.Array]:
+        outputs = self.outputs(params, inputs)
+        error = (
+            target[:, None, :] - outputs[..., None]
+        )  # [critics, batch, quantile, of the target], summed as it is made
+        size = jnp.abs(error)
+        huber = jnp.where(size < 1, jnp.square(error) / 2, size - 0.5)
+        level = (jnp.arange(self.quantiles) + 0.5) / self.quantiles
+        weight = jnp.abs(level[:, None] - (error < 0))
+        return (weight * huber).mean(axis=(-3, -2, -1)), self.read(outputs[0])

@@ -28,22 +28,29 @@ def td_target(
     critic_target: chex.ArrayTree,
     batch: Minibatch,
     next_action: chex.Array,
+    chosen: chex.Array | None = None,
 ) -> chex.Array:
     """y_i = r_i + gamma min_j Q'_ij(x', a'_1, ..., a'_N), with a' = mu'(o') + epsilon from `target_actions`.
 
     Adversarial: the others' a' moved against what the target takes, min_j Q'_ij. Returns what the critics' loss takes,
     leading axis [batch]. Where an episode terminated y_i = r_i.
+
+    Args:
+        chosen: numbers [target_critics] of the critics j that the minimum is over (REDQ, Chen et al. 2021); None: all.
     """
     next_inputs = jnp.concatenate([batch.next_x, next_action], axis=-1)
+    critic = group.target_critic
+    if chosen is not None:
+        critic_target = jax.tree.map(lambda leaf: leaf[chosen], critic_target)
     if group.algorithm.adversarial:
 
         def least(inputs: chex.Array) -> chex.Array:
-            return group.critic.values(critic_target, inputs).min(axis=0)
+            return critic.target_value(critic_target, inputs)
 
         next_inputs = worst_case(layout, hyper, least, next_inputs, batch.action_column)
     scale = group.algorithm.reward_scale
     reward = batch.reward if scale == 1 else scale * batch.reward
-    return group.critic.target(critic_target, reward, hyper.gamma * batch.discount, next_inputs)
+    return critic.target(critic_target, reward, hyper.gamma * batch.discount, next_inputs)
 
 
 def target_actions(
@@ -79,8 +86,8 @@ def target_actions(
 def critic_loss(
     group: Group, params: chex.ArrayTree, batch: Minibatch, target: chex.Array
 ) -> tuple[chex.Array, tuple[chex.Array, chex.Array]]:
-    """sum_j mean (Q_ij(x, a_1, ..., a_N) - y_i)^2, or the critics' cross-entropy to the target distribution; also (its
-    mean over the critics j, mean Q_i1)."""
+    """sum_j mean (Q_ij(x, a_1, ..., a_N) - y_i)^2, or what another head has in its place; also (its mean over the
+    critics j, mean Q_i1)."""
     loss, value = group.critic.loss(params, batch.inputs, target)
     return loss.sum(), (loss.mean(), value.mean())
 
@@ -95,7 +102,8 @@ def actor_loss(
     noise: Noise,
 ) -> tuple[chex.Array, chex.Array]:
     """-mean Q_i1(x, a_1, ..., mu_i(o_i), ..., a_N) + regularizer * mean mu_i's output^2, the others' actions from the
-    replay, adversarial: moved against Q_i1 there; twice, as value and as metric."""
+    replay, adversarial: moved against Q_i1 there; twice, as value and as metric. Q_i1: or the mean over the critics
+    (`actor_critics`)."""
     output = apply(group.actor, params, batch.observation)
     action = group.policy.sample(output, noise.action)
     inputs, change = batch.inputs, action - batch.action

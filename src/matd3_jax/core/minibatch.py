@@ -1,5 +1,6 @@
 """What one agent learns from in one update: its parts of replay rows, and its random numbers."""
 
+from functools import partial
 from typing import NamedTuple
 
 import chex
@@ -56,6 +57,8 @@ class Noise(NamedTuple):
     """Standard normal, of the same shapes; None without smoothing."""
     action: chex.Array | None
     """[batch, action size] of the own new action."""
+    critics: chex.Array | None = None
+    """int32 [target_critics] numbers of the critics that make the target; None: all do."""
 
 
 def places(layout: JointLayout, group: Group) -> Place:
@@ -132,7 +135,12 @@ def draw_noise(layout: JointLayout, group: Group, shape: tuple[int, int], key: c
         smoothing=draws(normal, smooth_key),
         action=group.policy.own_noise(action_key, (members, size)),
     )
-    return jax.tree.map(lambda draw: own_part(draw, axis, dimension=-2), noise)
+    noise = jax.tree.map(lambda draw: own_part(draw, axis, dimension=-2), noise)
+    if group.algorithm.target_critics is None:
+        return noise
+    keys = jax.random.split(jax.random.fold_in(key, 3), members)  # 0 to 2 would be the keys above
+    orders = jax.vmap(partial(jax.random.permutation, x=group.algorithm.num_critics))(keys)
+    return noise._replace(critics=orders[:, : group.algorithm.target_critics])
 
 
 def own_part(whole: chex.Array, axis: str | None, dimension: int) -> chex.Array:

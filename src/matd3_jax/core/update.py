@@ -38,7 +38,7 @@ class UpdateMetrics(NamedTuple):
     """Of one update, [num_agents] each."""
 
     critic_loss: chex.Array
-    """Mean squared error, or the categorical head's cross-entropy, averaged over the critics of the agent."""
+    """Mean squared error, or what another head has in its place, averaged over the critics of the agent."""
     q_value: chex.Array
     """Mean value that the first critic gives to the replayed joint actions."""
     actor_loss: chex.Array
@@ -214,7 +214,7 @@ def _update_agent(
     algorithm = group.algorithm
     if next_action is None:
         next_action = losses.target_actions(layout, group, hyper, mu_targets, own_target, batch, noise)
-    y = losses.td_target(layout, group, hyper, state.critic_target, batch, next_action)
+    y = losses.td_target(layout, group, hyper, state.critic_target, batch, next_action, noise.critics)
 
     critic_gradient = jax.grad(lambda params: losses.critic_loss(group, params, batch, y), has_aux=True)
     gradients, (loss, q_value) = _mean_over(axis, critic_gradient(state.critic))

@@ -60,18 +60,20 @@ def _member(layout: JointLayout, schedule: Schedule, group: Group) -> float:
         target_actions = sum(len(other.members) * _forward(_actor(other)) for other in layout.groups)
         if schedule.shared_minibatch and not schedule.sequential:
             target_actions /= len(group.members)
-    # The targets' values, the critics' own, their gradients.
-    critics = algorithm.num_critics * (3 * _forward(critic) + _inputs(critic))
+    targets = algorithm.target_critics or algorithm.num_critics
+    climbed = 1 if algorithm.actor_critics == "first" else algorithm.num_critics
+    # The targets' values; the critics' own, and their gradients.
+    critics = targets * _forward(critic) + algorithm.num_critics * (2 * _forward(critic) + _inputs(critic))
     # Where others' actions are moved: values at the actions as they are, and back to the first layer's inputs.
     slopes = (_forward(critic) + _inputs(critic) + critic[0] * critic[1]) if algorithm.adversarial else 0
-    # Through the first critic back to the own action: its part of the first layer's inputs, once each way.
+    # Through a critic back to the own action: its part of the first layer's inputs, once each way.
     through = _forward(critic) + _inputs(critic) + 2 * size * critic[1]
-    actors = 2 * _forward(actor) + _inputs(actor) + through + slopes
-    if algorithm.adversarial and critic[-1] == 1:
-        actors -= critic[-2]  # the slope of one scalar needs no value
+    actors = 2 * _forward(actor) + _inputs(actor) + climbed * (through + slopes)
+    if algorithm.adversarial and algorithm.critic_head != "categorical":
+        actors -= climbed * critic[-2] * critic[-1]  # the slope of a mean needs no outputs
     if schedule.random_order and algorithm.critic == "central":  # everybody's actions in x, by the policies of now
         actors += sum(len(other.members) * _forward(_actor(other)) for other in layout.learning_groups)
-    return target_actions + critics + algorithm.num_critics * slopes + actors / algorithm.policy_delay
+    return target_actions + critics + targets * slopes + actors / algorithm.policy_delay
 
 
 def _actor(group: Group) -> tuple[int, ...]:
