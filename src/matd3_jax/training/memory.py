@@ -47,8 +47,9 @@ def parts(trainer: TrainLoop, seeds: int, episodes: int = 0) -> dict[str, Part]:
     replay = trainer.replay_bytes // (trainer.sharding.padded_seeds * trainer.sharding.devices_per_seed)
     together = shares if trainer.on_cpu else rows  # seeds updated at the same time
     schedule, state = trainer.schedule, trainer.abstract_state()
-    networks = 2 * size(state.groups) // trainer.sharding.padded_seeds
-    others = seed_bytes(trainer) - networks
+    one = size(state.groups) // trainer.sharding.padded_seeds
+    others = seed_bytes(trainer) - 2 * one
+    networks = (3 if trainer.stop_seeds else 2) * one  # while they change; those that a stopped seed would keep
     capacity, most = (
         schedule.replay_capacity,
         max(group.algorithm.num_critics for group in trainer.layout.learning_groups),
