@@ -23,6 +23,7 @@ from matd3_jax import config  # noqa: E402
 from matd3_jax.cli import command  # noqa: E402
 from matd3_jax.cli.options import Command, others  # noqa: E402
 from matd3_jax.runtime import devices  # noqa: E402
+from matd3_jax.runtime.terminal import say  # noqa: E402
 from matd3_jax.training.session import TrainingSession  # noqa: E402
 
 EVENTS = {
@@ -84,7 +85,7 @@ def main(argv: Sequence[str]) -> int:
         "total": time.perf_counter() - BEGUN,
         "machine": devices.description(),
     }
-    print(json.dumps(report))
+    say(json.dumps(report))
     return 0
 
 

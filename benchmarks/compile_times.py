@@ -26,6 +26,7 @@ from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option
 from matd3_jax.errors import UserError
 from matd3_jax.runtime import devices
+from matd3_jax.runtime.terminal import say
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,9 +54,9 @@ def main(argv: Sequence[str]) -> int:
         "settings": list(argv),
         "environments": {},
     }
-    print(f"commit {report['commit']}; wall-clock seconds (seconds of a core)")
-    print(f"{'environment':<24} {'cache':<5} {'import':>7} " + " ".join(f"{name:>14}" for name in PROGRAMS)
-          + f" {'all':>14}  of it traced and lowered", flush=True)  # fmt: skip
+    say(f"commit {report['commit']}; wall-clock seconds (seconds of a core)")
+    say(f"{'environment':<24} {'cache':<5} {'import':>7} " + " ".join(f"{name:>14}" for name in PROGRAMS)
+          + f" {'all':>14}  of it traced and lowered")  # fmt: skip
     shares: Queue[set[int] | None] = Queue()
     for share in cores(options.at_once):
         shares.put(share)
@@ -75,10 +76,10 @@ def main(argv: Sequence[str]) -> int:
             found.pop("machine", None)
             report["environments"][env] = found
             for state in ("cold", "warm"):
-                print(row(env, state, found[state]), flush=True)
+                say(row(env, state, found[state]))
             options.write(report)
     for line in slow(report["environments"]):
-        print(line)
+        say(line)
     return 0
 
 

@@ -22,6 +22,7 @@ from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option
 from matd3_jax.errors import UserError
 from matd3_jax.runtime import devices
+from matd3_jax.runtime.terminal import say
 
 AXES: dict[str, list[int]] = {
     "seeds": [1, 2, 4, 8, 16, 32, 64],
@@ -65,9 +66,9 @@ def main(argv: Sequence[str]) -> int:
         "settings": list(argv),
         "others": {"seeds": options.few_seeds, **BASE},
     }
-    print(f"commit {report['commit']}; settings of the other axes {report['others']}")
-    print(f"{'axis':<7} {'value':>9} {'ms/iter':>11} {'env steps/s':>12} {'GFLOP':>8} {'XLA, MB':>9} "
-          f"{'of it replay':>12} {'temporaries':>11} {'process':>8} {'compiled in':>11}", flush=True)  # fmt: skip
+    say(f"commit {report['commit']}; settings of the other axes {report['others']}")
+    say(f"{'axis':<7} {'value':>9} {'ms/iter':>11} {'env steps/s':>12} {'GFLOP':>8} {'XLA, MB':>9} "
+          f"{'of it replay':>12} {'temporaries':>11} {'process':>8} {'compiled in':>11}")  # fmt: skip
     axes: dict[str, list[dict[str, Any]]] = {}
     report["axes"] = axes
     measured: dict[tuple, dict[str, Any]] = {}
@@ -85,12 +86,12 @@ def main(argv: Sequence[str]) -> int:
             point.pop("machine", None)
     report["exponents"] = exponents(axes)
     for axis, found in report["exponents"].items():
-        print(f"{axis}: " + "; ".join(f"{name} ~ {axis}^{k['all']:.2f} (upper half {k['upper']:.2f})"
+        say(f"{axis}: " + "; ".join(f"{name} ~ {axis}^{k['all']:.2f} (upper half {k['upper']:.2f})"
                                       for name, k in found.items()))  # fmt: skip
     options.write(report)
     if options.out is not None:
         growth_figure.draw(options.out.with_suffix(".png"), axes)
-        print(f"figure: {options.out.with_suffix('.png')}")
+        say(f"figure: {options.out.with_suffix('.png')}")
     return 0
 
 
@@ -140,13 +141,13 @@ def _measure(overrides: Sequence[str], options: Options) -> dict[str, Any]:
 
 def _show(axis: str, point: Mapping[str, Any]) -> None:
     if "error" in point:
-        print(f"{axis:<7} {point['value']:>9,} {point['error']}", flush=True)
+        say(f"{axis:<7} {point['value']:>9,} {point['error']}")
         return
     mb = {name: value / 1e6 for name, value in point["memory"].items()}
-    print(f"{axis:<7} {point['value']:>9,} {1000 * point['cycle_seconds']:>11,.1f} "
+    say(f"{axis:<7} {point['value']:>9,} {1000 * point['cycle_seconds']:>11,.1f} "
           f"{point['env_steps_per_second']:>12,.0f} {point['product_flops_of_a_cycle'] / 1e9:>8.2f} "
           f"{mb['xla']:>9,.0f} {mb['replay']:>12,.0f} {mb['temporaries']:>11,.0f} {mb['process']:>8,.0f} "
-          f"{point['compile_seconds']:>9.1f} s", flush=True)  # fmt: skip
+          f"{point['compile_seconds']:>9.1f} s")  # fmt: skip
 
 
 if __name__ == "__main__":

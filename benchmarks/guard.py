@@ -27,6 +27,7 @@ from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option
 from matd3_jax.errors import UserError
 from matd3_jax.runtime import devices, files
+from matd3_jax.runtime.terminal import complain, say
 
 RECORDED = Path(__file__).with_suffix(".json")
 SETTINGS = ("env=simple_spread", "seeds=4", "replay_capacity=100000", "total_steps=100000", "eval_every=0")
@@ -81,16 +82,16 @@ def main(argv: Sequence[str]) -> int:
         about = {"machine": devices.description(), "versions": devices.versions(), "commit": commit()}
         found[platform] = {**about, "ratios": ratios, "in_turns": spread}
         files.write_json(RECORDED, found)
-        print(f"written to {RECORDED}")
+        say(f"written to {RECORDED}")
     recorded = found[platform]["ratios"]
     for key, bound in BOUNDS.items():
         turns = " ({:.3g} to {:.3g} in turns)".format(*spread[key]) if key in spread else ""
-        print(f"{bound.meaning}: {ratios[key]:.3g}{turns}; recorded {recorded[key]:.3g}, "
+        say(f"{bound.meaning}: {ratios[key]:.3g}{turns}; recorded {recorded[key]:.3g}, "
               f"at most {bound.limit(recorded[key]):.3g}")  # fmt: skip
-    print(f"took {time.monotonic() - begun:.0f} s", flush=True)
+    say(f"took {time.monotonic() - begun:.0f} s")
     broken = failures(ratios, recorded)
     if broken:
-        print(f"guard: much worse than recorded: {'; '.join(broken)}", file=sys.stderr)
+        complain(f"guard: much worse than recorded: {'; '.join(broken)}")
     return 1 if broken else 0
 
 

@@ -27,6 +27,7 @@ from matd3_jax import config
 from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option
 from matd3_jax.runtime import devices
+from matd3_jax.runtime.terminal import say
 from matd3_jax.training.session import TrainingSession
 
 STEPS = 200
@@ -61,13 +62,13 @@ def main(argv: Sequence[str]) -> int:
         "cases": [],
     }
     for key in ("machine", "versions", "commit"):
-        print(f"{key}: {report[key]}", flush=True)
-    print(f"{'case':<26} {'ours':>22} {'their own loop':>22} {'ours / own':>18}", flush=True)
+        say(f"{key}: {report[key]}")
+    say(f"{'case':<26} {'ours':>22} {'their own loop':>22} {'ours / own':>18}")
     for case in CASES:
         if options.only.lower() in case.name.lower():
             entry = measure(case, options.turns, options.seconds, options.num_envs, seeds)
             report["cases"].append(entry)
-            print(line(entry), flush=True)
+            say(line(entry))
     options.write(report)
     return 0
 

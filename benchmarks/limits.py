@@ -30,6 +30,7 @@ from matd3_jax.cli.options import Command, option
 from matd3_jax.core import update
 from matd3_jax.core.agents import Group
 from matd3_jax.runtime import devices
+from matd3_jax.runtime.terminal import say
 from matd3_jax.training import memory
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.session import TrainingSession
@@ -351,18 +352,18 @@ def main(argv: Sequence[str]) -> int:
     found, rows = roofline(trainer, options.repeats)
     for row in sorted(rows, key=lambda row: -row["count"] * row["seconds_alone"]):
         shapes = f"{row['equation']:<14} {list(row['left'])} {list(row['right'])}"
-        print(f"{shapes:<56} {row['flops'] / row['seconds_alone'] / 1e9:8.1f} GFLOP/s alone "
+        say(f"{shapes:<56} {row['flops'] / row['seconds_alone'] / 1e9:8.1f} GFLOP/s alone "
               f"{row['flops'] / row['seconds_together'] / 1e9:8.1f} each of {trainer.mesh.size} at once   "
               f"{row['count'] * row['seconds_alone'] / found.alone:6.1%} of the roofline")  # fmt: skip
     steps = trainer.num_seeds * trainer.iteration_steps
     counted = compiled_flops(trainer)
     report |= {"floor": dataclasses.asdict(found), "products": rows, "flops_in_compiled_program": counted}
     report["env_steps_per_second"] = steps / found.seconds
-    print(f"products of one env step: {found.flops / steps / 1e6:.3f} MFLOP by hand, "
+    say(f"products of one env step: {found.flops / steps / 1e6:.3f} MFLOP by hand, "
           f"{counted / steps / 1e6:.3f} in the compiled program")  # fmt: skip
-    print(f"least time of an iteration ({steps:,} env steps): products {found.alone * 1e3:.2f} ms (devices as when "
+    say(f"least time of an iteration ({steps:,} env steps): products {found.alone * 1e3:.2f} ms (devices as when "
           f"alone; {found.together * 1e3:.2f} all at once), memory {found.moved * 1e3:.2f} ms")  # fmt: skip
-    print(f"at most {steps / found.seconds:,.0f} env steps/s, at {found.gflops:.0f} GFLOP/s")
+    say(f"at most {steps / found.seconds:,.0f} env steps/s, at {found.gflops:.0f} GFLOP/s")
     options.write(report)
     return 0
 

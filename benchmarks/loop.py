@@ -24,6 +24,7 @@ from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option, others
 from matd3_jax.config import Config
 from matd3_jax.runtime import devices
+from matd3_jax.runtime.terminal import say
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.session import TrainingSession
 
@@ -65,7 +66,7 @@ def main(argv: Sequence[str]) -> int:
         "memory": {**loop.memory(), **process_memory()},
         "machine": devices.description(),
     }
-    print(json.dumps(report))
+    say(json.dumps(report))
     return 0
 
 

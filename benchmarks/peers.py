@@ -29,6 +29,7 @@ from benchmarks.peers_scripts.rows import WORKERS, Row, Variant
 from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option
 from matd3_jax.runtime import devices
+from matd3_jax.runtime.terminal import say
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +77,7 @@ def main(argv: Sequence[str]) -> int:
         "gflops_before": throughput.matmul_gflops(),
     }
     for key in ("machine", "versions", "commit", "gflops_before"):
-        print(f"{key}: {report[key]}", flush=True)
+        say(f"{key}: {report[key]}")
     lines: list[list[str]] = []
     entries: list[dict[str, Any]] = []
     all_versions: dict[str, dict[str, str | None]] = {}
@@ -87,8 +88,8 @@ def main(argv: Sequence[str]) -> int:
             entries += [entry(row, outcomes) for row in group]
             lines += [line(row, outcomes, versions) for row in group]
     report |= {"peers": all_versions, "rows": entries, "gflops_after": throughput.matmul_gflops()}
-    print(f"gflops_after: {report['gflops_after']}\n")
-    print(table(lines))
+    say(f"gflops_after: {report['gflops_after']}\n")
+    say(table(lines))
     options.write(report)
     return 0
 
@@ -98,9 +99,9 @@ def prepare(folder: Path, only: Sequence[str]) -> int:
     failed = False
     for name, worker in WORKERS.items():
         if worker.requirements and name.lower() in only:
-            print(f"{name}: {'; '.join(' '.join(part) for part in worker.requirements)}", flush=True)
+            say(f"{name}: {'; '.join(' '.join(part) for part in worker.requirements)}")
             error = process.install(worker, folder)
-            print(f"{name}: {error or 'installed'}", flush=True)
+            say(f"{name}: {error or 'installed'}")
             failed |= error is not None
     return int(failed)
 
@@ -124,10 +125,10 @@ def measure(
                     if variant.worker not in versions:
                         versions[variant.worker] = _ask(pool[:1], do="versions")[0]
                     took = _ask(pool, do="prepare", case=variant.case)[0]["seconds"]
-                    print(f"{variant.worker}, {variant.label}: ready in {took:.0f} s", flush=True)
+                    say(f"{variant.worker}, {variant.label}: ready in {took:.0f} s")
                 except WorkerError as error:
                     outcomes[k] = str(error)
-                    print(f"{variant.worker}, {variant.label}: {error}", flush=True)
+                    say(f"{variant.worker}, {variant.label}: {error}")
             for turn in range(turns):
                 for k, variant in list(variants.items())[:: -1 if turn % 2 else 1]:
                     outcome = outcomes[k]
@@ -137,10 +138,10 @@ def measure(
                         pool = pools[variant.worker][: variant.processes]
                         answers = _ask(pool, do="measure", case=variant.case, seconds=seconds)
                         outcome.append(sum(a["env_steps"] / a["seconds"] for a in answers))
-                        print(f"turn {turn + 1}: {variant.worker}, {variant.label}: {outcome[-1]:,.0f}", flush=True)
+                        say(f"turn {turn + 1}: {variant.worker}, {variant.label}: {outcome[-1]:,.0f}")
                     except WorkerError as error:
                         outcomes[k] = str(error)
-                        print(f"turn {turn + 1}: {variant.worker}, {variant.label}: {error}", flush=True)
+                        say(f"turn {turn + 1}: {variant.worker}, {variant.label}: {error}")
         finally:
             for pool in pools.values():
                 for member in pool:

@@ -17,6 +17,7 @@ from benchmarks.options import OfARun
 from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option
 from matd3_jax.runtime import devices
+from matd3_jax.runtime.terminal import say
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,18 +47,18 @@ def main(argv: Sequence[str]) -> int:
         "rows": [],
     }
     for key in ("machine", "versions", "commit", "gflops"):
-        print(f"{key}: {report[key]}")
-    print(f"{'environments':>12} {'part':<12} {'env steps/s':>12} {'slowest':>10} {'fastest':>10} "
-          f"{'roofline':>8}", flush=True)  # fmt: skip
+        say(f"{key}: {report[key]}")
+    say(f"{'environments':>12} {'part':<12} {'env steps/s':>12} {'slowest':>10} {'fastest':>10} "
+          f"{'roofline':>8}")  # fmt: skip
     for n in options.num_envs:
         parts = None if options.loops else ("environment",)
         settings = [f"env={options.env}", *schedule(n), *options.overrides]
         rows = throughput.measure(settings, options.seeds, options.repeats, options.seconds, parts)
         for row in rows:
             report["rows"].append({"num_envs": n, **row})
-            print(f"{n:>12} {row['part']:<12} {row['env_steps_per_second']:>12,.0f} {row['slowest']:>10,.0f} "
+            say(f"{n:>12} {row['part']:<12} {row['env_steps_per_second']:>12,.0f} {row['slowest']:>10,.0f} "
                   f"{row['fastest']:>10,.0f} {row['of_floor']:>8.1%}"
-                  f"   compiled in {row['compile_seconds']:.0f} s", flush=True)  # fmt: skip
+                  f"   compiled in {row['compile_seconds']:.0f} s")  # fmt: skip
     options.write(report)
     return 0
 

@@ -22,6 +22,7 @@ from matd3_jax.cli import command, sweep
 from matd3_jax.cli.options import Command, option
 from matd3_jax.config import Config
 from matd3_jax.runtime import devices
+from matd3_jax.runtime.terminal import say
 from matd3_jax.sweep import batching
 from matd3_jax.sweep.search_space import SearchSpace
 from matd3_jax.training.session import TrainingSession
@@ -70,7 +71,7 @@ def main(argv: Sequence[str]) -> int:
         "env_steps_per_second_of_one_setting": float(np.median(rates)),
         "compile_seconds": {"one setting": compiled[0], "programs of the sweep": compiled[1:]},
     }
-    print(f"{report['sweep']} against {len(settings) * base.seeds} seeds of one setting: cost "
+    say(f"{report['sweep']} against {len(settings) * base.seeds} seeds of one setting: cost "
           f"{np.median(cost):.3f} ({cost.min():.3f} to {cost.max():.3f}); {np.median(rates):,.0f} env steps/s; "
           f"compiled in {compiled[0]:.0f} s against {' + '.join(f'{s:.0f}' for s in compiled[1:])} s")  # fmt: skip
     options.write(report)

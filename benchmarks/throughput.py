@@ -29,6 +29,7 @@ from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option
 from matd3_jax.core import replay
 from matd3_jax.runtime import devices
+from matd3_jax.runtime.terminal import say
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import TrainState
@@ -57,19 +58,19 @@ def main(argv: Sequence[str]) -> int:
     }
     report["gflops_before"] = matmul_gflops()
     for key in ("machine", "versions", "commit", "gflops_before"):
-        print(f"{key}: {report[key]}")
-    print(f"{'seeds':>5} {'part':<12} {'env steps/s':>12} {'slowest':>10} {'fastest':>10} {'updates/s':>10} "
-          f"{'roofline':>9}", flush=True)  # fmt: skip
+        say(f"{key}: {report[key]}")
+    say(f"{'seeds':>5} {'part':<12} {'env steps/s':>12} {'slowest':>10} {'fastest':>10} {'updates/s':>10} "
+          f"{'roofline':>9}")  # fmt: skip
     rows = []
     for seeds in options.seeds:
         for row in measure(options.overrides, seeds, options.repeats, options.seconds):
             rows.append(row)
-            print(f"{row['seeds']:>5} {row['part']:<12} {row['env_steps_per_second']:>12,.0f} {row['slowest']:>10,.0f} "
+            say(f"{row['seeds']:>5} {row['part']:<12} {row['env_steps_per_second']:>12,.0f} {row['slowest']:>10,.0f} "
                   f"{row['fastest']:>10,.0f} {row['updates_per_second']:>10,.1f} {row['of_floor']:>9.1%}"
-                  f"   compiled in {row['compile_seconds']:.1f} s", flush=True)  # fmt: skip
+                  f"   compiled in {row['compile_seconds']:.1f} s")  # fmt: skip
     report["rows"] = rows
     report["gflops_after"] = matmul_gflops()
-    print(f"gflops_after: {report['gflops_after']}")
+    say(f"gflops_after: {report['gflops_after']}")
     options.write(report)
     return 0
 

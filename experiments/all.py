@@ -30,6 +30,7 @@ from matd3_jax.cli.options import Command, option, others
 from matd3_jax.errors import UserError, nearest
 from matd3_jax.runs.paths import check_directory
 from matd3_jax.runtime import files
+from matd3_jax.runtime.terminal import say
 from matd3_jax.training import cost
 
 STUDIES: dict[str, Study] = {
@@ -80,18 +81,18 @@ def main(argv: Sequence[str]) -> int:
     failed = 0
     for name, one in chosen.items():
         out_folder, more = _places(one, parsed[name], given)
-        print(f"\n==== {name}", flush=True)
+        say(f"\n==== {name}")
         lines += [f"## {one.title}", ""]
         try:
             claims = study.run(one, [*given.rest, *more])
             lines += verdict.lines(one.claims(Table({})) if claims is None else claims)
             lines += [] if claims is None else ["", f"[Protocol, all values, figure]({out_folder.name}/table.md)"]
         except UserError as error:
-            print(f"error: {error}")
+            say(f"error: {error}")
             lines += [*verdict.lines(one.claims(Table({}))), "", f"Could not be run: {error}"]
             failed = 2
         except Stopped as stopped:
-            print("stopped; resume with the same command")
+            say("stopped; resume with the same command")
             return stopped.code
         lines.append("")
     small = any(options.scale == "small" for options in parsed.values())
@@ -99,7 +100,7 @@ def main(argv: Sequence[str]) -> int:
     given.out.mkdir(parents=True, exist_ok=True)
     summary = given.out / ("summary_small.md" if small else "summary.md")
     files.write_text(summary, "\n".join([*head, *lines]).rstrip() + "\n")
-    print(f"\nsummary: {summary}")
+    say(f"\nsummary: {summary}")
     return failed
 
 
@@ -114,15 +115,15 @@ def _estimate(chosen: dict[str, Study], parsed: dict[str, StudyOptions], given: 
     """What all experiments lack, each measured a while, and the total: the exit code."""
     estimator, steps, seconds, failed = Estimator(0.0), 0, 0.0, 0
     for name, one in chosen.items():
-        print(f"\n==== {name}", flush=True)
+        say(f"\n==== {name}")
         estimator.seconds += EACH_STUDY
         try:
             found = study.estimate(one, [*given.rest, *_places(one, parsed[name], given)[1]], estimator)
             steps, seconds = steps + found[0], seconds + found[1]
         except UserError as error:
-            print(f"error: {error}")
+            say(f"error: {error}")
             failed = 2
-    print(f"\nall: {steps:,} env steps, {cost.duration(seconds)}")
+    say(f"\nall: {steps:,} env steps, {cost.duration(seconds)}")
     return failed
 
 

@@ -22,6 +22,7 @@ from matd3_jax.cli.options import Command, option, others
 from matd3_jax.figures import style
 from matd3_jax.runs.paths import check_directory
 from matd3_jax.runtime import devices, files
+from matd3_jax.runtime.terminal import say
 from matd3_jax.stats.intervals import compare, t_interval
 from matd3_jax.stats.text import plus_minus
 
@@ -60,7 +61,7 @@ def main(argv: Sequence[str]) -> int:
             seeds=options.seeds,
             total_steps=options.total_steps,
             log_every=100 * EPISODE,
-            callback=lambda row, algo=algo: print(algo, int(row["step"][0]), row["return_agents"].mean(), flush=True),
+            callback=lambda row, algo=algo: say(f"{algo} {int(row['step'][0])} {row['return_agents'].mean()}"),
         )
         seconds[algo] = round(time.monotonic() - begun, 1)
         ours[algo] = result.metrics
@@ -110,7 +111,7 @@ def report(out: Path) -> None:
     figure.axes[0].set_ylabel("training return, summed over agents")
     style.save(figure, out / "curves.png", dpi=130)
     files.write_text(out / "table.md", "\n".join(lines) + "\n")
-    print("\n".join(lines))
+    say("\n".join(lines))
 
 
 def blocks(episode: np.ndarray, curves: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

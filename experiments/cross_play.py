@@ -31,6 +31,7 @@ from matd3_jax.evaluation.cross_play_table import Mean
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runs.paths import check_directory
 from matd3_jax.runtime import devices, files
+from matd3_jax.runtime.terminal import say
 from matd3_jax.stats.text import plus_minus
 from matd3_jax.training import checkpoint
 
@@ -81,7 +82,7 @@ def main(argv: Sequence[str]) -> int:
         missing = [" against ".join(figures.NAMES[algo] for algo in pair) for pair in PAIRINGS if pair not in runs[env]]
         if missing:
             if env not in tasks:
-                print(f"{env}: not played, for in {folder} there is no finished run of {', '.join(missing)}")
+                say(f"{env}: not played, for in {folder} there is no finished run of {', '.join(missing)}")
             continue
         own = {pair: runs[env][pair] for pair in PAIRINGS}
         facts = planned(own, options)
@@ -90,7 +91,7 @@ def main(argv: Sequence[str]) -> int:
         tasks[env] = play(env, own, facts, options)
         out.mkdir(parents=True, exist_ok=True)
         write(tasks, *where)
-        print(f"{env}: played", flush=True)
+        say(f"{env}: played")
     if not tasks:
         raise UserError("there is nothing to report")
     report(tasks, out)
@@ -229,7 +230,7 @@ def report(tasks: Mapping[str, Task], out: Path) -> None:
             lines.append(f"| {' | '.join(cells)} | {0 if others is None else others.pairs:,} |")
     lines += ["", "![Team's returns with own partners and with strangers](cross_play.png)"]
     files.write_text(out / "cross_play.md", "\n".join(lines) + "\n")
-    print("\n".join(lines[:-2]))
+    say("\n".join(lines[:-2]))
 
 
 def draw(tasks: Mapping[str, Task], path: Path) -> None:

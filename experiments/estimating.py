@@ -15,6 +15,7 @@ import jax
 
 from matd3_jax.config import Config
 from matd3_jax.runtime import devices
+from matd3_jax.runtime.terminal import say
 from matd3_jax.sweep import batching
 from matd3_jax.sweep.runner import Sweep, fitting_seeds
 from matd3_jax.training import checkpoint, cost
@@ -149,20 +150,20 @@ def report(batches: Sequence[Batch], estimator: Estimator) -> tuple[int, float]:
         how = "measured" if measured else "scaled from a measured program"
         names = [f"{member.name} ({member.seeds} seeds)" for member in batch.members]
         begun = f", {batch.done:,} env steps of each done" if batch.done else ""
-        print(f"program {number}: {', '.join(names)}{begun}", flush=True)
-        print(
+        say(f"program {number}: {', '.join(names)}{begun}")
+        say(
             f"    {batch.seeds} seeds x {left:,} env steps at {speed} of all seeds ({how}): "
             f"{cost.duration(batch.seeds * left / rate)}, {memory / 1e9:.2f} GB"
         )
         steps, seconds, most = steps + batch.seeds * left, seconds + batch.seeds * left / rate, max(most, memory)
     if batches:
-        print(
+        say(
             f"total: {steps:,} env steps in {len(batches)} program{'s' * (len(batches) > 1)}, {cost.duration(seconds)} "
             f"(compiling and evaluations apart); at most {most / 1e9:.2f} GB at a time, "
             f"{devices.free_memory() / 1e9:.2f} GB are free"
         )
     else:
-        print("total: nothing is missing")
+        say("total: nothing is missing")
     return steps, seconds
 
 

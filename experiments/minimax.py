@@ -26,6 +26,7 @@ from matd3_jax.evaluation.cross_play_table import Mean, Pairings
 from matd3_jax.figures import heat_map
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import files
+from matd3_jax.runtime.terminal import say
 from matd3_jax.stats.text import plus_minus
 
 ENV = "simple_adversary"
@@ -221,7 +222,7 @@ def report(out: Path) -> None:
     heat_map.draw(out / "cross_play.png", names, pairings, "Physical Deception, seeds x seeds")
     lines += ["![Returns between strangers](cross_play.png)"]
     files.write_text(out / "cross_play.md", "\n".join(lines) + "\n")
-    print("\n".join(lines[:-1]))
+    say("\n".join(lines[:-1]))
 
 
 def main(argv: Sequence[str]) -> int:

@@ -34,6 +34,7 @@ from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option
 from matd3_jax.errors import UserError
 from matd3_jax.runtime import files
+from matd3_jax.runtime.terminal import say
 from matd3_jax.stats.text import NOTHING
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -96,7 +97,7 @@ def main(argv: Sequence[str]) -> int:
     if any(entry.folder for entry in paper):
         claims_figure.draw([(e.study, e.short, e.claim, e.small) for e in paper], options.figure)
     files.write_text(options.page, text)
-    print(f"{counts(paper, hours)}\npage: {options.page}\nfigure: {options.figure}")
+    say(f"{counts(paper, hours)}\npage: {options.page}\nfigure: {options.figure}")
     return 0
 
 

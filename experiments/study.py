@@ -24,6 +24,7 @@ from matd3_jax.config import Config
 from matd3_jax.errors import UserError
 from matd3_jax.runs.paths import check_directory
 from matd3_jax.runtime import devices, files
+from matd3_jax.runtime.terminal import say
 from matd3_jax.sweep import batching, runner
 from matd3_jax.sweep.runner import Stopped
 
@@ -112,7 +113,7 @@ of_evaluations = functools.partial(Study, keep=("eval_*",), evaluations=True, da
 def main(study: Study, argv: Sequence[str]) -> int:
     """Run a study's command; the exit code."""
     if asks_for_help(argv):
-        print(study.command.help())
+        say(study.command.help())
         return 0
     if parse(study, argv).estimate:
         estimate(study, argv, Estimator())
@@ -201,7 +202,7 @@ def estimate(study: Study, argv: Sequence[str], estimator: Estimator) -> tuple[i
     """Print what a call would train and how long it would take; (env steps of all seeds, seconds). Writes nothing."""
     plan = Plan.of(study, argv)
     left = len({label for label, _ in plan.missing.values()})
-    print(f"{study.title}: {left} of {len(plan.wanted)} settings to train, {len(plan.wanted) - left} not")
+    say(f"{study.title}: {left} of {len(plan.wanted)} settings to train, {len(plan.wanted) - left} not")
     return estimating.report(estimating.planned(plan.settings, plan.folder), estimator)
 
 
@@ -243,7 +244,7 @@ def report(study: Study, data: Data, out: Path, options: StudyOptions) -> list[C
     lines += [*departures(study, data, options), *verdict.lines(claims), "", verdict.DEFINITIONS, ""]
     lines += [*study.details(data.table), "", *machine_time.lines(data.facts), f"![{study.title}]({study.figure})"]
     files.write_text(out / "table.md", "\n".join(lines) + "\n")
-    print("\n".join(lines[:-2]))
+    say("\n".join(lines[:-2]))
     return claims
 
 

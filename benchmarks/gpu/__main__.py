@@ -29,6 +29,7 @@ from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option
 from matd3_jax.runs.paths import check_directory
 from matd3_jax.runtime import devices
+from matd3_jax.runtime.terminal import say
 
 PARTS: dict[str, Callable[[Report, float, Length], None]] = {
     "check": lambda report, scale, length: checks.run(report),
@@ -70,15 +71,15 @@ def main(argv: Sequence[str]) -> int:
     devices.prepare()
     report = Report(options.out, options.minutes)
     for key, value in report.facts.items():
-        print(f"{key}: {value}", flush=True)
+        say(f"{key}: {value}")
     length = Length() if scale >= 1 else Length(iterations=2, seconds=max(0.02, scale), repeats=2)
     for part in PARTS:
         if part in options.parts:
             PARTS[part](report, scale, length)
     figure.draw(report)
-    print("\n".join(targets.lines(report)))
+    say("\n".join(targets.lines(report)))
     if report.left:
-        print(f"no time was left for: {'; '.join(report.left)}")
+        say(f"no time was left for: {'; '.join(report.left)}")
     return 1 if report.wrong else 0
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from benchmarks.commit import commit
 from matd3_jax.errors import UserError
 from matd3_jax.runtime import devices, files
+from matd3_jax.runtime.terminal import say
 
 Row = dict[str, Any]
 
@@ -60,7 +61,7 @@ class Report:
         row |= {"took_seconds": round(time.monotonic() - begun, 1), "commit": self.facts["commit"]}
         self.parts.setdefault(part, {})[name] = row
         self.save()
-        print(f"{part}: {name}: {shown(row)}", flush=True)
+        say(f"{part}: {name}: {shown(row)}")
         return None if "failed" in row else row
 
     def get(self, part: str, name: str) -> Row | None:

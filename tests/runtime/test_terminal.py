@@ -39,6 +39,16 @@ def test_nobody_reads():
     assert done.returncode == 0 and done.stderr == b""
 
 
+@pytest.mark.parametrize("module", ["experiments.cooperative", "benchmarks.loop", "matd3_jax.train"])
+def test_nobody_reads_the_help(module):
+    """Of studies and benchmarks, too, which print by the same functions (a rule of ruff sees to it)."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run([sys.executable, "-m", module, "--help"], stdout=writer, stderr=subprocess.PIPE, timeout=60)
+    os.close(writer)
+    assert done.returncode == 0 and done.stderr == b""
+
+
 def test_a_full_disk_behind_the_output():
     with open("/dev/full", "w") as full:
         done = subprocess.run(
