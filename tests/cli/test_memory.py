@@ -9,6 +9,7 @@ from matd3_jax import config
 from matd3_jax.cli import evaluate, render, train
 from matd3_jax.errors import UserError
 from matd3_jax.runtime import devices
+from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.recording import Recorder
 from matd3_jax.training.session import TrainingSession
 
@@ -37,8 +38,18 @@ def sixteen(monkeypatch):
     monkeypatch.setattr(devices, "free_memory", lambda sharing=1: FREE)
 
 
+@pytest.fixture
+def no_start(monkeypatch):
+    """What is not refused fails at once, instead of taking the machine's memory."""
+
+    def init(trainer, keys):
+        raise AssertionError("it was not refused")
+
+    monkeypatch.setattr(TrainLoop, "init", init)
+
+
 @pytest.mark.parametrize("case", TOO_MUCH)
-def test_training_that_cannot_fit_is_refused(case, sixteen, tmp_path):
+def test_training_that_cannot_fit_is_refused(case, sixteen, no_start, tmp_path):
     more, wanted = TOO_MUCH[case]
     with pytest.raises(UserError, match=r"GB are needed, but only 16.00 GB are free; .* GB for ") as error:
         train.main([*SMALL, *more, f"out={tmp_path / 'runs'}"])
@@ -53,7 +64,7 @@ def test_training_that_cannot_fit_is_refused(case, sixteen, tmp_path):
         TrainingSession(config.load(fits)).check_memory(recorded=True)
 
 
-def test_from_python_too(sixteen):
+def test_from_python_too(sixteen, no_start):
     with pytest.raises(UserError, match="eval_episodes at most"):
         TrainingSession(config.load([*SMALL, "eval_episodes=1000000000"])).start()
 
