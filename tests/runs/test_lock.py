@@ -46,6 +46,15 @@ def test_a_second_process_learns_who_works_there_and_a_killed_one_is_taken_over(
         other.kill()
 
 
+def test_commands_start_without_fcntl():
+    """As on Windows, which lacks it."""
+    commands = "check, crossplay, evaluate, export, plot, render, report, sweep, train"
+    code = f"import sys; sys.modules['fcntl'] = None; from matd3_jax.cli import {commands}"
+    code += "; from matd3_jax.runs import lock; sys.exit(lock.fcntl is not None)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_it_can_be_held_again_after_its_end_and_after_an_error(tmp_path, kind):
     for _ in range(2):
         with pytest.raises(RuntimeError), lock.held(tmp_path):

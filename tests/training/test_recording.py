@@ -150,12 +150,15 @@ def test_an_older_checkpoint_sets_the_newer_ones_aside(copy, whole):
     assert not list((copy / "checkpoints").glob("*set_aside"))
 
 
-def test_a_checkpoint_that_is_a_link_is_set_aside_and_what_it_leads_to_stays(copy, whole):
-    """On another disk, say. The link itself is removed with the next checkpoint."""
+@pytest.mark.parametrize("there", [True, False])
+def test_a_checkpoint_that_is_a_link_is_set_aside_and_what_it_leads_to_stays(copy, whole, there):
+    """On another disk, say, which may be there or not. The link itself is removed with the next checkpoint."""
     *_, before, last = checkpoint.steps(copy / "checkpoints")
     place, elsewhere = copy / "checkpoints" / str(last), copy.parent / "elsewhere"
     place.rename(elsewhere)
     place.symlink_to(elsewhere)
+    if not there:
+        shutil.rmtree(elsewhere)
     kept = {path: path.read_bytes() for path in elsewhere.rglob("*") if path.is_file()}
     (copy / "summary.json").unlink()
     assert f"resumed from the checkpoint of env step {before:,}" in resume(copy, step=before)
