@@ -122,7 +122,7 @@ def _update(trainer: TrainLoop, group: Group) -> Iterator[tuple[Product, float]]
         yield from ((part, 1 / shared) for part in _forward(members, batch, sizes))
     critic = (update.critic_input_size(layout, group), *hidden, group.critic.num_outputs)
     twins = algorithm.num_critics
-    targets, climbed = algorithm.target_critics or twins, 1 if algorithm.actor_critics == "first" else twins
+    targets, climbed = algorithm.critics_in_target, algorithm.critics_climbed
     every, target, first = (_first_to_last(number, batch, critic) for number in (twins, targets, climbed))
     yield from ((part, 1) for part in target + every)
     yield Product("bi,bo->io", (batch, critic[0]), (batch, twins * critic[1])), 1

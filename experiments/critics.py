@@ -8,7 +8,8 @@ evaluations in the last third.
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments import evaluations, figures, study, verdict
+from experiments import evaluations, figures, study
+from experiments.one_at_a_time import against_base, better, label
 from experiments.study import StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
@@ -36,7 +37,7 @@ def settings(scale: str, options: StudyOptions) -> dict[str, list[str]]:
     if scale == "small":
         more = ["seeds=2", "total_steps=60000", "eval_every=20000", "eval_episodes=5"]
     return {
-        f"{env}-{name.replace(' ', '_')}": [
+        f"{env}-{label(name)}": [
             f"env={env}", f"env.split={split}", "algo=matd3", "recipe=fast", *changes, *more
         ]
         for env, split in ROBOTS.items()
@@ -51,19 +52,11 @@ def part(table: Table, env: str, name: str) -> Table:
 
 
 def claims(table: Table) -> list[Claim]:
-    found = []
+    found: list[Claim] = []
     for env in ROBOTS:
-        base = evaluations.late(part(table, env, BASE))
-        for name in CRITICS:
-            if name != BASE:
-                found.append(
-                    verdict.compare(
-                        f"{env}: critics with {name} lead to more than the recipe's (a question of ours)",
-                        "mean evaluation in the last third",
-                        (name, evaluations.late(part(table, env, name))),
-                        (BASE, base),
-                    )
-                )
+        values = {name: evaluations.late(part(table, env, name)) for name in CRITICS}
+        text = f"{env}: critics with {{}} lead to more than the recipe's (a question of ours)"
+        found += against_base(values, BASE, better(text))
     return found
 
 

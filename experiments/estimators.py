@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments import evaluations, figures, study, verdict
+from experiments.one_at_a_time import QUANTITY, against_base, better, label
 from experiments.overestimation import measured
 from experiments.study import StudyOptions
 from experiments.tidy import Table
@@ -69,7 +70,7 @@ def line(task: str, name: str) -> list[str]:
 
 def settings(scale: str, options: StudyOptions) -> dict[str, list[str]]:
     return {
-        f"{task}-{name.replace(',', '').replace(' ', '_')}": [
+        f"{task}-{label(name)}": [
             *line(task, name), *SCALES[scale][task], "keep_checkpoints=1"
         ]
         for task in TASKS
@@ -94,7 +95,7 @@ def bias(part: Table) -> np.ndarray | None:
 
 
 def claims(table: Table) -> list[Claim]:
-    found = []
+    found: list[Claim] = []
     for task in TASKS:
         biases = {number: bias(part(table, task, name)) for number, name in MINIMA.items()}
         there = {number: values for number, values in biases.items() if values is not None}
@@ -107,17 +108,10 @@ def claims(table: Table) -> list[Claim]:
             slope = verdict.negative(verdict.slope(numbers, np.concatenate(list(there.values()))))
             claim = Claim(text, quantity, slope, found=words)
         found.append(claim)
-        base = evaluations.late(part(table, task, BASE))
-        for name in ESTIMATORS:
-            if name != BASE:
-                found.append(
-                    verdict.compare(
-                        f"{task}: {name} leads to more than MATD3's twins (a question of ours)",
-                        "mean evaluation in the last third",
-                        (name, evaluations.late(part(table, task, name))),
-                        (BASE, base),
-                    )
-                )
+        values = {name: evaluations.late(part(table, task, name)) for name in ESTIMATORS}
+        found += against_base(
+            values, BASE, better(f"{task}: {{}} leads to more than MATD3's twins (a question of ours)")
+        )
     return found
 
 
@@ -134,17 +128,14 @@ def draw(table: Table, path: Path) -> None:
             figures.cross(axis, 100 * over, returns, color, name)
         axis.axvline(0, color="black", linewidth=0.8)
         axis.set_xlabel("estimate minus true value, % of the true value")
-        axis.set_ylabel("mean evaluation in the last third")
+        axis.set_ylabel(QUANTITY)
         axis.set_title(figures.task(task))
         axis.margins(x=0.25)
     figures.save(figure, path)
 
 
 def details(table: Table) -> list[str]:
-    rows = [
-        "| task | target of | seeds | env steps | relative bias, % | mean evaluation in the last third | last return |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    rows = []
     for task in TASKS:
         for name in ESTIMATORS:
             found = part(table, task, name)
@@ -154,8 +145,13 @@ def details(table: Table) -> list[str]:
             steps, values = curve
             cells = [task, name, str(len(values)), f"{steps[-1]:,.0f}"]
             cells += map(figures.interval, (100 * over, evaluations.late(found), values[:, -1]))
-            rows.append(f"| {' | '.join(cells)} |")
-    return [*rows, "", "In brackets: 95 % intervals of the mean. Bias: in the last third of training."]
+            rows.append(cells)
+    head = ("task", "target of", "seeds", "env steps", "relative bias, %", QUANTITY, "last return")
+    return [
+        *evaluations.table(head, rows),
+        "",
+        "In brackets: 95 % intervals of the mean. Bias: in the last third of training.",
+    ]
 
 
 STUDY = study.of_evaluations(

@@ -4,6 +4,8 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from experiments import evaluations, figures, study, verdict
 from experiments.study import StudyOptions
 from experiments.tidy import Table
@@ -51,8 +53,7 @@ class OneAtATime:
 
     def claims(self, table: Table) -> list[Claim]:
         found = dict.fromkeys(self.changes) | {name: evaluations.late(p) for name, p in self.parts(table).items()}
-        base = self.base, found[self.base]
-        return [self.claim(name, base, (name, found[name])) for name in self.changes if name != self.base]
+        return against_base(found, self.base, self.claim)
 
     def draw(self, table: Table, path: Path) -> None:
         there = {name: evaluations.late(part) for name, part in self.parts(table).items()}
@@ -72,6 +73,18 @@ class OneAtATime:
             for name, part in self.parts(table).items()
         ]
         return evaluations.table(("changed", QUANTITY.replace("evaluation ", ""), *evaluations.HEAD), rows)
+
+
+def against_base(
+    found: Mapping[str, np.ndarray | None], base: str, claim: Callable[[str, tuple, tuple], Claim]
+) -> list[Claim]:
+    """What is claimed of each setting beside the base, of values [seeds] by name; `claim`: as in `OneAtATime`."""
+    return [claim(name, (base, found[base]), (name, values)) for name, values in found.items() if name != base]
+
+
+def better(text: str) -> Callable[[str, tuple, tuple], Claim]:
+    """The claim, `text` with {} for its name, that a setting leads to more than the base."""
+    return lambda name, base, changed: verdict.compare(text.format(name), QUANTITY, changed, base)
 
 
 def label(name: str) -> str:

@@ -18,7 +18,7 @@ class Algorithm:
     num_critics: int = 2
     """The target takes the minimum over that many target critics; the actor climbs the first."""
     target_critics: int | None = None
-    """Each target is made of so many critics, drawn at random for every agent and update (REDQ); None: of all."""
+    """Number of critics that make a target, drawn at random for every agent and update (REDQ); None: all do."""
     actor_critics: Literal["first", "all"] = "first"
     """The actor climbs the first critic's value, or the mean of all critics' (REDQ, TQC)."""
     critic_norm: Literal["none", "layer"] = "none"
@@ -32,7 +32,7 @@ class Algorithm:
     critic_quantiles: int = 25
     """Of the quantile head."""
     dropped_quantiles: int = 2
-    """The target leaves out so many for each of its critics, the largest of all critics' together."""
+    """Quantiles that the target leaves out for each of its critics: the largest of all critics' together (TQC)."""
     policy_delay: int = 2
     """Actor and targets move with every policy_delay-th update (d in the paper)."""
     hidden: tuple[int, ...] = (64, 64)
@@ -60,6 +60,16 @@ class Algorithm:
     """The team plays a given policy, deterministically, and does not learn: it has no critics and no targets."""
     sync_targets: bool = True
     """Targets start as copies of the online networks; False: as independent draws, as in the authors' program."""
+
+    @property
+    def critics_in_target(self) -> int:
+        """Number of critics that make a target."""
+        return self.target_critics or self.num_critics
+
+    @property
+    def critics_climbed(self) -> int:
+        """Number of critics, from the first on, whose mean value the actor climbs."""
+        return 1 if self.actor_critics == "first" else self.num_critics
 
 
 class HyperParams(NamedTuple):

@@ -6,6 +6,7 @@ from typing import Any, Protocol
 import chex
 import jax
 import jax.numpy as jnp
+import optax
 
 from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.core.networks import StackedMLP, apply
@@ -48,8 +49,7 @@ class Critic(Protocol):
 
 def of(algorithm: Algorithm) -> Critic:
     """The critics of an algorithm's agents."""
-    climbed = 1 if algorithm.actor_critics == "first" else algorithm.num_critics
-    network = (algorithm.num_critics, algorithm.hidden, algorithm.critic_norm == "layer", climbed)
+    network = (algorithm.num_critics, algorithm.hidden, algorithm.critic_norm == "layer", algorithm.critics_climbed)
     if algorithm.critic_head == "scalar":
         return ScalarCritic(*network)
     if algorithm.critic_head == "quantile":
@@ -59,8 +59,8 @@ def of(algorithm: Algorithm) -> Critic:
 
 
 def of_target(algorithm: Algorithm) -> Critic:
-    """The critics that make a target: all of them, or as many as are drawn for it."""
-    return of(dataclasses.replace(algorithm, num_critics=algorithm.target_critics or algorithm.num_critics))
+    """The critics that make a target: all of them, or those that are drawn for it."""
+    return of(dataclasses.replace(algorithm, num_critics=algorithm.critics_in_target))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +71,7 @@ class _Perceptrons:
     hidden: tuple[int, ...]
     layer_norm: bool
     climbed: int
-    """So many of the critics, the first ones, are what the actor climbs."""
+    """Number of critics, from the first on, whose mean value the actor climbs."""
 
     @property
     def num_outputs(self) -> int:
@@ -204,11 +204,8 @@ class QuantileCritic(_Perceptrons):
 
     def loss(self, params: chex.ArrayTree, inputs: chex.Array, target: chex.Array) -> tuple[chex.Array, chex.Array]:
         outputs = self.outputs(params, inputs)
-        error = (
-            target[:, None, :] - outputs[..., None]
-        )  # [critics, batch, quantile, of the target], summed as it is made
-        size = jnp.abs(error)
-        huber = jnp.where(size < 1, jnp.square(error) / 2, size - 0.5)
+        # [critics, batch, quantiles, the target's], summed as it is made.
+        error = target[:, None, :] - outputs[..., None]
         level = (jnp.arange(self.quantiles) + 0.5) / self.quantiles
         weight = jnp.abs(level[:, None] - (error < 0))
-        return (weight * huber).mean(axis=(-3, -2, -1)), self.read(outputs[0])
+        return (weight * optax.huber_loss(error)).mean(axis=(-3, -2, -1)), self.read(outputs[0])

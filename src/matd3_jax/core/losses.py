@@ -7,6 +7,7 @@ et al. 2019).
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import chex
 import jax
@@ -43,10 +44,7 @@ def td_target(
     if chosen is not None:
         critic_target = jax.tree.map(lambda leaf: leaf[chosen], critic_target)
     if group.algorithm.adversarial:
-
-        def least(inputs: chex.Array) -> chex.Array:
-            return critic.target_value(critic_target, inputs)
-
+        least = partial(critic.target_value, critic_target)
         next_inputs = worst_case(layout, hyper, least, next_inputs, batch.action_column)
     scale = group.algorithm.reward_scale
     reward = batch.reward if scale == 1 else scale * batch.reward

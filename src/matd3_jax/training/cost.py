@@ -60,8 +60,7 @@ def _member(layout: JointLayout, schedule: Schedule, group: Group) -> float:
         target_actions = sum(len(other.members) * _forward(_actor(other)) for other in layout.groups)
         if schedule.shared_minibatch and not schedule.sequential:
             target_actions /= len(group.members)
-    targets = algorithm.target_critics or algorithm.num_critics
-    climbed = 1 if algorithm.actor_critics == "first" else algorithm.num_critics
+    targets, climbed = algorithm.critics_in_target, algorithm.critics_climbed
     # The targets' values; the critics' own, and their gradients.
     critics = targets * _forward(critic) + algorithm.num_critics * (2 * _forward(critic) + _inputs(critic))
     # Where others' actions are moved: values at the actions as they are, and back to the first layer's inputs.
