@@ -174,6 +174,6 @@ def test_own_algorithm(read, tmp_path, monkeypatch):
 
 def run_copy(line, folder):
     words = shlex.split(line, comments=True)
-    if words[:2] == ["python", "-m"]:
+    if words[:1] == ["python"]:
         env = {**os.environ, "PYTHONPATH": str(folder / "src")}
         subprocess.run([sys.executable, *words[1:]], env=env, check=True)
