@@ -2,6 +2,7 @@
 
 import re
 
+import pytest
 from study_cases import NOISE, fake_run
 
 from experiments import all as everything
@@ -18,6 +19,9 @@ TINY = ["algo.hidden=[8]", "batch_size=16", "learning_starts=200", "replay_capac
 def test_estimate_measures_and_writes_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(estimating, "EACH", 0.05)
     monkeypatch.setattr(estimating, "STEPS", 200)
+    measured = []
+    measure = estimating.measure
+    monkeypatch.setattr(estimating, "measure", lambda batch: measured.append(measure(batch)) or measured[-1])
     argv = ["scale=small", "only=simple_spread-maddpg", "seeds=2", "total_steps=1000000", *TINY]
     argv += [f"runs={tmp_path / 'runs'}", f"out={tmp_path / 'out'}", "estimate=true"]
     assert cooperative.main(argv) == 0
@@ -28,7 +32,9 @@ def test_estimate_measures_and_writes_nothing(tmp_path, monkeypatch, capsys):
         r"    2 seeds x (1,00\d,\d00) env steps at ([\d,]+) env steps/s .*\(measured\): (.*), .* GB", lines[2]
     )
     steps, rate = (int(number.replace(",", "")) for number in found.groups()[:2])
-    assert rate > 100 and found[3] == estimating.cost.duration(2 * steps / rate)
+    exact = measured[0].steps  # the printed rate is rounded, and may lie beyond the next minute
+    assert len(measured) == 1 and exact > 100 and rate == pytest.approx(exact, rel=0.05)
+    assert found[3] == estimating.cost.duration(2 * steps / exact)
     assert lines[3].startswith(f"total: {2 * steps:,} env steps in 1 program, {found[3]}")
     assert not list(tmp_path.iterdir())
 
