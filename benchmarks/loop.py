@@ -25,6 +25,7 @@ from matd3_jax.cli.options import Command, option, others
 from matd3_jax.config import Config
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.terminal import say
+from matd3_jax.thread_pool import programs_in
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.session import TrainingSession
 
@@ -148,7 +149,7 @@ def product_flops(jaxpr: Any) -> float:
             shape = equation.invars[0].aval.shape
             total += 2 * math.prod(shape[i] for i in contracted) * math.prod(equation.outvars[0].aval.shape)
             continue
-        inner = sum(product_flops(part) for value in equation.params.values() for part in _programs(value))
+        inner = sum(product_flops(part) for value in equation.params.values() for part in programs_in(value))
         if equation.primitive.name == "scan":
             inner *= equation.params["length"]
         elif equation.primitive.name == "shard_map":  # what each device does
@@ -157,12 +158,6 @@ def product_flops(jaxpr: Any) -> float:
             raise ValueError("products in a loop of unknown length")
         total += inner
     return total
-
-
-def _programs(value: Any) -> list[Any]:
-    """Programs within a parameter of an operation."""
-    values = value if isinstance(value, list | tuple) else [value]
-    return [getattr(v, "jaxpr", v) for v in values if hasattr(getattr(v, "jaxpr", v), "eqns")]
 
 
 if __name__ == "__main__":

@@ -28,7 +28,11 @@ WORKERS = 4
 IN_WORKER = "PYTEST_XDIST_WORKER" in os.environ
 """Set by pytest-xdist before this file is read, and by it in all that a worker starts."""
 
+THREADS = str(4 * max(os.cpu_count(), 2))
+"""Of XLA's CPU backend, for the robots that MJX steps on two devices: see `matd3_jax.thread_pool`."""
+
 if not IN_WORKER:  # workers get all of it from the process that starts them
+    os.environ["NPROC"] = THREADS
     flags = [f"--{name}={str(value).lower()}" for name, value in OPTIONS.items()]
     os.environ["XLA_FLAGS"] = " ".join([*flags, os.environ.get("XLA_FLAGS", "")]).strip()
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # workers share an accelerator

@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1] / "src" / "matd3_jax"
 
 ALLOWED = {
     "core": {"envs", "errors"},
-    "envs": {"errors", "private"},
+    "envs": {"errors", "private", "thread_pool"},
     "stats": {"errors"},
 }
 """Of ours, what these packages may import besides themselves; the others are free, but for `cli`."""

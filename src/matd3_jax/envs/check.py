@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from matd3_jax.envs.environment import Environment, TimeStep
 from matd3_jax.envs.spaces import Box, Discrete, MultiDiscrete, Simplex
 from matd3_jax.errors import UserError, one_line
+from matd3_jax.thread_pool import calls_lapack, make_room_for_lapack
 
 TEAMS = ("agents", "adversaries")
 
@@ -22,6 +23,9 @@ def check(env: Environment) -> None:
 
     Looks at what it declares, then traces `reset`, `step` and what reads states once: nothing is computed. The message
     is one line that names the field, what it is, and what it has to be.
+
+    Where LAPACK is called, XLA gets the threads that this takes on a CPU, or a RuntimeWarning says that it is too late
+    for that (`thread_pool.make_room_for_lapack`).
 
     Example:
         >>> from matd3_jax import envs
@@ -99,7 +103,7 @@ class _Check:
     # ---- traced ------------------------------------------------------------------------------------------------------
 
     def behavior(self) -> None:
-        env, key = self.env, jax.random.key(0)
+        env, key = self.env, jax.eval_shape(lambda: jax.random.key(0))  # no array yet: JAX is not started by it
         found = self.traced("reset", env.reset, key)
         if not isinstance(found, tuple) or len(found) != 2:
             self.fail(f"reset returns {_shown(found)}; must return (state, observations)")
@@ -126,13 +130,16 @@ class _Check:
 
     def traced(self, name: str, function: Callable, *args: Any) -> Any:
         try:
-            return jax.eval_shape(function, *args)
+            jaxpr, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
         except UserError:
             raise
         except Exception as error:  # whatever the environment's own code raises
             words = one_line(error)
             short = words if len(words) <= 300 else words[:300] + "..."
             raise UserError(f"{self.name}: {name} cannot be traced by JAX: {type(error).__name__}: {short}") from error
+        if calls_lapack(jaxpr):
+            make_room_for_lapack(f"{self.name}.{name}")
+        return shapes
 
     def observations(self, where: str, found: Any) -> None:
         agents = self.env.agents

@@ -23,6 +23,7 @@ from matd3_jax.interop.foreign_states import flat, like, raw
 from matd3_jax.interop.playground_layout import owners
 from matd3_jax.interop.playground_split import Split, as_split, share_out
 from matd3_jax.runtime.terminal import say
+from matd3_jax.thread_pool import make_room_for_lapack
 
 
 class PlaygroundState(NamedTuple):
@@ -237,6 +238,8 @@ def _load(id: str | None, impl: str, kwargs: Kwargs) -> Loaded:
     downloads = id not in registry.dm_control_suite.ALL_ENVS
     if downloads and not _menagerie().exists():
         say(f"MuJoCo Playground downloads the robots' models (mujoco_menagerie), once, into {_menagerie()}")
+    if impl == "jax":
+        make_room_for_lapack(f"env=playground env.id={id}")
     changes = {"impl": impl} | dict(_flattened(kwargs))
     try:
         with quiet(), quiet_mujoco(), contextlib.redirect_stderr(io.StringIO()), jax.ensure_compile_time_eval():

@@ -16,6 +16,7 @@ from matd3_jax.envs.robots.partition.partition import KinematicTree, Layout, des
 from matd3_jax.envs.robots.quiet import quiet, quiet_mujoco
 from matd3_jax.errors import OptionError
 from matd3_jax.private import brax_fluid
+from matd3_jax.thread_pool import make_room_for_lapack
 
 BACKENDS = ("spring", "positional", "generalized")
 
@@ -75,6 +76,8 @@ def calling() -> Iterator[None]:
 @functools.cache
 def load(robot: str, backend: str) -> Any:
     """brax's environment. Its arrays are made outside whatever is being traced: they outlive it."""
+    if backend == "generalized":
+        make_room_for_lapack(f"env.backend={backend}")
     with quiet(), quiet_mujoco(), jax.ensure_compile_time_eval():
         return import_brax().get_environment(FACTS[robot].brax_name, backend=backend)
 

@@ -13,6 +13,7 @@ from matd3_jax.envs.robots.engines.engine import Physical
 from matd3_jax.envs.robots.engines.models import corrected
 from matd3_jax.envs.robots.engines.quietly import mjx
 from matd3_jax.private import mjx_implementation
+from matd3_jax.thread_pool import make_room_for_lapack
 
 NEWTON = {"mjx": (8, 8), "mjx_fast": (1, 4)}
 """Iterations of the Newton solver and of its line search. In float32, 8 and 8 give what MuJoCo's default of 100 and 50
@@ -68,6 +69,7 @@ def load(file: str, physics: str) -> MjxEngine:
     without implicit damping and one Newton iteration, brax's settings for MJX. Both: contact margins as MuJoCo had them
     before 3.5.0 and C's contact frames.
     """
+    make_room_for_lapack(f"physics={physics}")
     model = corrected(file)
     model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
     model.opt.iterations, model.opt.ls_iterations = NEWTON[physics]
