@@ -4,14 +4,16 @@ Ours is the compiled rollout of a run, its actions random, its transitions writt
 `num_envs` environments of each of `seeds` seeds, which are spread over the devices. The library's own is the loop of
 its documentation: random actions, reset where an episode ends, one environment in Python, or 32 in one program where
 the library is in JAX. In each turn both are measured for `seconds` (compilation left out), the order reversed from turn
-to turn; the ratio is that of the same turn. The cases are lines of `benchmarks/interop_cases.py`. One that fails stands
-there with its error.
+to turn; the ratio is that of the same turn. The cases are lines of `benchmarks/interop_cases.py`, each in a process of
+its own. One that fails stands there with its error.
 """
 
 import dataclasses
+import multiprocessing
 import sys
 import time
 from collections.abc import Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
 from functools import partial
 from importlib import metadata
 from typing import Any
@@ -64,13 +66,20 @@ def main(argv: Sequence[str]) -> int:
     for key in ("machine", "versions", "commit"):
         say(f"{key}: {report[key]}")
     say(f"{'case':<26} {'ours':>22} {'their own loop':>22} {'ours / own':>18}")
-    for case in CASES:
-        if options.only.lower() in case.name.lower():
-            entry = measure(case, options.turns, options.seconds, options.num_envs, seeds)
-            report["cases"].append(entry)
-            say(line(entry))
+    with process_for_each() as process:
+        for case in CASES:
+            if options.only.lower() in case.name.lower():
+                chosen = (case, options.turns, options.seconds, options.num_envs, seeds)
+                report["cases"].append(process.submit(measure, *chosen).result())
+                say(line(report["cases"][-1]))
     options.write(report)
     return 0
+
+
+def process_for_each() -> Executor:
+    """One process after the other: XLA's threads, of which a case may need more, are fixed once one has computed."""
+    spawn = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(1, spawn, devices.prepare, max_tasks_per_child=1)
 
 
 def measure(case: Case, turns: int, seconds: float, num_envs: int, seeds: int) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """The benchmark of other libraries' environments: its table, and one case measured for a moment."""
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import numpy as np
@@ -18,6 +19,15 @@ def test_the_settings_of_all_cases_can_be_read():
         assert settings.env["name"] in envs.names()
 
 
+broken = Case("broken", ("env=pettingzoo", "env.id=no_such_module"), CASES[0].own, ())
+
+
+def test_a_case_has_a_process_of_its_own(monkeypatch, capsys):
+    monkeypatch.setattr(interop, "CASES", (broken,))
+    assert interop.main(["seeds=1"]) == 0
+    assert "failed: OptionError: env.id=no_such_module" in capsys.readouterr().out
+
+
 def test_a_case_is_measured_in_turns(tmp_path, capsys, monkeypatch):
     sides = []
 
@@ -27,12 +37,12 @@ def test_a_case_is_measured_in_turns(tmp_path, capsys, monkeypatch):
         assert sides[-1] == "own" or done == 2 * 3 * interop.STEPS  # seeds x environments x env steps
         return {"own": 10.0, "ours": 30.0}[sides[-1]] * len(sides)
 
-    broken = Case("broken", ("env=pettingzoo", "env.id=no_such_module"), interop_cases.CASES[0].own, ())
     guess = interop_cases.settings("pettingzoo", "host_cases")
     case = Case("guess", guess, lambda steps: interop_cases.parallel("host_cases", steps), ("numpy",))
     monkeypatch.setattr(interop, "CASES", (case, broken))
     monkeypatch.setattr(interop, "STEPS", 25)
     monkeypatch.setattr(interop, "rate", rate)
+    monkeypatch.setattr(interop, "process_for_each", lambda: ThreadPoolExecutor(1))  # sees what is changed here
     out = tmp_path / "report.json"
     assert interop.main(["turns=3", "num_envs=3", "seeds=2", f"out={out}"]) == 0
     assert sides == ["ours", "own", "own", "ours", "ours", "own"]
