@@ -99,7 +99,7 @@ def collect(
     random: act uniformly at random instead, but for frozen teams: warm-up without the policies. unroll: steps that one
     iteration holds.
     """
-    num_envs = env_state.episode_step.shape[0]
+    num_envs, on_demand = env_state.episode_step.shape[0], env.on_host or env.costly_reset
     noise_key, step_key, reset_key = jax.random.split(key, 3)
     # All noise of the rollout in one draw for each group, not one for each step.
     noise = _noise(layout, noise_key, (length, num_envs), random)
@@ -109,7 +109,7 @@ def collect(
         before = carry.state if keep_states else None
         quantile = 0.5 if carry.noise_quantile is None else carry.noise_quantile
         action = act(layout, policy, carry.observation, draws, quantile, random)
-        if env.on_host:
+        if on_demand:
             after, *fresh = jax.vmap(env.step_or_reset)(step_keys, fresh, carry.state, env_actions(layout, action))
         else:
             after = jax.vmap(env.step)(step_keys, carry.state, env_actions(layout, action))
@@ -132,8 +132,8 @@ def collect(
 
     step_keys, reset_keys = (jax.random.split(k, (length, num_envs)) for k in (step_key, reset_key))
     # Every step has a fresh start at hand, drawn in one batch: inside the loop they would be as many, drawn one by one.
-    # Not on the host, where each reset would be made: there they are made where they are needed.
-    fresh = reset_keys if env.on_host else jax.vmap(jax.vmap(env.reset))(reset_keys)
+    # Not on the host, nor where a reset is costly: there they are made where they are needed.
+    fresh = reset_keys if on_demand else jax.vmap(jax.vmap(env.reset))(reset_keys)
     fresh_quantiles = None
     if env_state.noise_quantile is not None:
         shape = (length, *env_state.noise_quantile.shape)

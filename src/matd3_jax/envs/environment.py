@@ -116,18 +116,27 @@ class Environment(abc.ABC):
         """
         return False
 
+    @property
+    def costly_reset(self) -> bool:
+        """Whether a reset takes as long as many steps: training then resets only where an episode has ended."""
+        return False
+
     def step_or_reset(
         self, key: chex.PRNGKey, reset_key: chex.PRNGKey, state: Any, action: tuple[chex.Array, ...]
     ) -> tuple[TimeStep, Any, tuple[chex.Array, ...]]:
         """`step`, then the state and the observations to go on from: those of `reset` where the episode ended.
 
-        What the training loop calls of environments `on_host`, which reset only where they have to; of others it resets
-        whole batches beforehand, which is quicker in a compiled program.
+        What the training loop calls of environments `on_host` and of those with a `costly_reset`; of others it resets
+        whole batches beforehand, which is quicker in a compiled program. Under `vmap` a reset is computed where any of
+        the environments needs one.
         """
         after = self.step(key, state, action)
         ended = after.terminated | after.truncated
-        going = jax.tree.map(
-            lambda new, old: jnp.where(ended, new, old), self.reset(reset_key), (after.state, after.observation)
+        # A condition would become a selection under vmap, and reset in every step; a loop ends with the last that runs.
+        _, *going = jax.lax.while_loop(
+            lambda carry: carry[0],
+            lambda _: (jnp.zeros((), bool), *self.reset(reset_key)),
+            (ended, after.state, after.observation),
         )
         return after, *going
 

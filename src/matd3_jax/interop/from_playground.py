@@ -128,6 +128,11 @@ class PlaygroundTask(Environment):
         return tuple(name.replace("/", "_") for name in self._metrics)
 
     @property
+    def costly_reset(self) -> bool:
+        """Some tasks let the robot come to rest first: 200 steps of the physics in CheetahRun."""
+        return True
+
+    @property
     def mj_model(self) -> Any:
         """`mujoco.MjModel` of the robot, for drawing; shared, not to be changed."""
         return self.wrapped.mj_model

@@ -122,6 +122,10 @@ class JointTeam(Environment):
     def on_host(self) -> bool:
         return self.env.on_host
 
+    @property
+    def costly_reset(self) -> bool:
+        return self.env.costly_reset
+
     def step_or_reset(
         self, key: chex.PRNGKey, reset_key: chex.PRNGKey, state: Any, action: tuple[chex.Array, ...]
     ) -> tuple[TimeStep, Any, tuple[chex.Array, ...]]:
