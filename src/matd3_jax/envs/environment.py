@@ -132,13 +132,16 @@ class Environment(abc.ABC):
         """
         after = self.step(key, state, action)
         ended = after.terminated | after.truncated
-        # A condition would become a selection under vmap, and reset in every step; a loop ends with the last that runs.
-        _, *going = jax.lax.while_loop(
-            lambda carry: carry[0],
-            lambda _: (jnp.zeros((), bool), *self.reset(reset_key)),
-            (ended, after.state, after.observation),
-        )
-        return after, *going
+
+        # A condition would become a selection under vmap, and reset in every step; a loop runs where any is left. With
+        # the same key each time around XLA would take the reset out of the loop, and compute it in every step as well.
+        def restart(carry: tuple) -> tuple:
+            _, key, *_ = carry
+            return jnp.zeros((), bool), jax.random.fold_in(key, 0), *self.reset(key)
+
+        start = (ended, reset_key, after.state, after.observation)
+        _, _, state, observation = jax.lax.while_loop(lambda carry: carry[0], restart, start)
+        return after, state, observation
 
     @abc.abstractmethod
     def observe(self, state: Any) -> tuple[chex.Array, ...]:
