@@ -24,7 +24,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::DeprecationW
 FOLDER = ROOT / "docs" / "tutorials"
 TINY = "learning_starts=400 batch_size=16 'algo.hidden=[8]' eval_episodes=2"
 SHORTER = {
-    "first_run": [("total_steps=100000", f"total_steps=1000 {TINY}"), ("total_steps=150000", "total_steps=1200")],
+    "first_run": [("total_steps=300000", f"total_steps=1000 {TINY}"), ("total_steps=450000", "total_steps=1200")],
     "own_environment": [
         ("total_steps=40_000, learning_starts=2_000", "total_steps=1_500, learning_starts=500"),
         ("episodes=100", "episodes=2"),
