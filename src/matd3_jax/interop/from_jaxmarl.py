@@ -18,6 +18,7 @@ from matd3_jax.errors import OptionError, nearest, one_line
 from matd3_jax.interop.foreign_states import flat, like, raw
 from matd3_jax.interop.import_jaxmarl import import_jaxmarl
 from matd3_jax.interop.jaxmarl_facts import Facts, facts
+from matd3_jax.thread_pool import make_room_for_lapack
 
 MABRAX = ("ant_4x2", "halfcheetah_6x1", "hopper_3x1", "humanoid_9|8", "walker2d_2x3")
 """Ids of JaxMARL's environments in brax, which reset by themselves unless `auto_reset=False`."""
@@ -179,6 +180,8 @@ class JaxMARLTask(_JaxMARLEnvironment):
 @functools.cache
 def _make(id: str | None, kwargs: Kwargs) -> Any:
     """The environment, its arrays made outside whatever is being traced: they outlive it."""
+    if kwargs.get("backend") in ("generalized", "mjx"):  # of brax's robots
+        make_room_for_lapack(f"env.kwargs.backend={kwargs['backend']}")
     jaxmarl = import_jaxmarl("env=jaxmarl")
     if id is None:
         raise OptionError("env=jaxmarl needs an id as jaxmarl.make takes it, for instance env.id=MPE_simple_spread_v3")

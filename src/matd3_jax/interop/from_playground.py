@@ -235,6 +235,8 @@ def bodies(mj_model: Any) -> dict[int, int]:
 @functools.cache
 def _load(id: str | None, impl: str, kwargs: Kwargs) -> Loaded:
     """Make a task, its arrays outside whatever is being traced: they outlive it."""
+    if impl == "jax":
+        make_room_for_lapack("env=playground")
     registry = import_registry()
     if id is None:
         raise OptionError("env=playground needs an id, the name of a task, for instance env.id=CheetahRun")
@@ -243,8 +245,6 @@ def _load(id: str | None, impl: str, kwargs: Kwargs) -> Loaded:
     downloads = id not in registry.dm_control_suite.ALL_ENVS
     if downloads and not _menagerie().exists():
         say(f"MuJoCo Playground downloads the robots' models (mujoco_menagerie), once, into {_menagerie()}")
-    if impl == "jax":
-        make_room_for_lapack(f"env=playground env.id={id}")
     changes = {"impl": impl} | dict(_flattened(kwargs))
     try:
         with quiet(), quiet_mujoco(), contextlib.redirect_stderr(io.StringIO()), jax.ensure_compile_time_eval():
