@@ -12,8 +12,8 @@ from matd3_jax.runtime.devices import cores
 THREADS = 4
 """For each core or CPU device, whichever are more: one for each LAPACK call that may be under way, and some free ones.
 
-A program of MJX makes two calls at a time on each device. Others pay for more threads than cores: their matrix products
-are split into as many parts as there are threads, and with 16 on two cores simple_spread trains at 0.6 of its speed."""
+A device may have several. Programs that call nothing pay for more threads than cores: their matrix products are split
+into as many parts as there are threads, and with 16 on two cores simple_spread trains at 0.6 of its speed."""
 
 LAPACK = frozenset(
     {
