@@ -14,6 +14,7 @@ from typing import Any
 from benchmarks import throughput
 from benchmarks.commit import commit
 from benchmarks.options import OfARun
+from matd3_jax import config, envs
 from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option
 from matd3_jax.runtime import devices
@@ -38,6 +39,7 @@ COMMAND = Command("python -m benchmarks.robots", Options, __doc__)
 def main(argv: Sequence[str]) -> int:
     options = COMMAND.parse(argv)
     devices.prepare()
+    envs.make(**config.load([f"env={options.env}", *options.overrides]).env)  # before JAX computes, as in `throughput`
     report: dict[str, Any] = {
         "machine": devices.description(),
         "versions": devices.versions(),

@@ -24,7 +24,7 @@ import numpy as np
 from benchmarks import limits
 from benchmarks.commit import commit
 from benchmarks.options import OfARun
-from matd3_jax import config
+from matd3_jax import config, envs
 from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option
 from matd3_jax.core import replay
@@ -50,6 +50,7 @@ COMMAND = Command("python -m benchmarks.throughput", Options, __doc__)
 def main(argv: Sequence[str]) -> int:
     options = COMMAND.parse(argv)
     devices.prepare()
+    envs.make(**config.load(options.overrides).env)  # before JAX computes: it may ask XLA for threads
     report: dict[str, Any] = {
         "machine": devices.description(),
         "versions": devices.versions(),
