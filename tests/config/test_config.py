@@ -32,6 +32,7 @@ FAMILY = {  # joint, critic, number of critics, policy delay
     "ddpg": (True, "own", 1, 1),
     "m3ddpg": (False, "central", 1, 1),
     "m3matd3": (False, "central", 2, 2),
+    "hybrid": (True, "central", 2, 2),
 }
 
 
@@ -40,7 +41,7 @@ def test_every_algorithm_has_the_papers_settings(name):
     algo = config.load([f"algo={name}"]).algo
     assert (algo.joint, algo.critic, algo.num_critics, algo.policy_delay) == FAMILY[name]
     assert {key: getattr(algo, key) for key in PAPER} == PAPER
-    assert algo.name == name
+    assert algo.name == name and algo.hands_over == (name == "hybrid")
     steps = (1e-3, 1e-5) if name in MINIMAX else (0, 0)  # adv-eps and adv-eps-s of the authors of M3DDPG
     assert (algo.adversarial_step, algo.adversarial_step_team) == steps and algo.adversarial == (name in MINIMAX)
 

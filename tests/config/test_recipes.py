@@ -15,8 +15,8 @@ ROBOTS = [
 ]
 
 # tau, delay, smoothing, critics, whose critic, one agent in everybody's place: Ackermann et al. 2019, on decentralized
-# controllers of robots; iddpg and ddpg, not in the paper, with iltd3's and td3's settings, m3ddpg and m3matd3 with
-# maddpg's and matd3's.
+# controllers of robots; iddpg and ddpg, not in the paper, with iltd3's and td3's settings, m3ddpg, m3matd3 and hybrid
+# with maddpg's and matd3's.
 ALGORITHMS = {
     "matd3": (0.01, 2, 0.2, 2, "central", False),
     "maddpg": (0.01, 1, 0.0, 1, "central", False),
@@ -26,6 +26,7 @@ ALGORITHMS = {
     "ddpg": (0.005, 1, 0.0, 1, "own", True),
     "m3ddpg": (0.01, 1, 0.0, 1, "central", False),
     "m3matd3": (0.01, 2, 0.2, 2, "central", False),
+    "hybrid": (0.01, 2, 0.2, 2, "central", True),
 }
 
 
@@ -56,7 +57,7 @@ def test_algorithms_stay_what_they_are_in_the_fast_recipe(algo):
     found = (a.policy_delay, a.target_noise, a.num_critics, a.critic, a.joint)
     assert found == ALGORITHMS[algo][1:]
     own = {"name", "policy_delay", "target_noise", "num_critics", "critic", "joint"}
-    own |= {"adversarial_step", "adversarial_step_team"}
+    own |= {"adversarial_step", "adversarial_step_team", "hands_over"}
     differing = {k for k, v in dataclasses.asdict(a).items() if v != getattr(base.algo, k)}
     assert differing <= own
     assert dataclasses.replace(mine, algo=base.algo) == base

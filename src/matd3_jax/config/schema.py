@@ -65,6 +65,7 @@ class AlgoConfig:
 
     name: str = setting(SHAPES)
     joint: bool = setting(SHAPES)
+    hands_over: bool = setting(SHAPES, before=False)
     critic: str = setting(SHAPES, choices=("central", "own"))
     num_critics: int = setting(SHAPES, least=1)
     target_critics: int | None = setting(SHAPES, least=1, before=None)
@@ -178,6 +179,7 @@ class Config:
     replay_capacity: int = setting(SHAPES, least=1)
     learning_starts: int = setting(SHAPES, least=1)
     warmup: str = setting(SHAPES, choices=("policy", "random"))
+    switch_at: int | None = setting(SHAPES, least=1, before=None)
     init: str | None = setting(SHAPES, before=None, text=True)
     init_checkpoint: str | None = setting(SHAPES, before=None, text=True)
     init_seed: int | None = setting(SHAPES, before=None, least=0)
@@ -200,6 +202,11 @@ class Config:
     def teams(self) -> dict[str, AlgoConfig]:
         """The algorithm of each team."""
         return {"agents": self.algo, "adversaries": self.adversary or self.algo}
+
+    @property
+    def hands_over(self) -> bool:
+        """Whether the agents of a team learn first, and one agent in their place from `switch_at` on."""
+        return any(team.hands_over and not team.frozen for team in self.teams().values())
 
     @property
     def seed_numbers(self) -> range:

@@ -68,6 +68,10 @@ def _check_start(config: "Config", need: Any) -> None:
         "init_checkpoint= and init_seed= go with init=RUN_DIR",
     )
     need(config.init != "", "init=: must name a run directory")
+    need(
+        config.switch_at is None or config.hands_over,
+        f"switch_at={config.switch_at} goes with algo=hybrid",
+    )
     _check_checkpoint("init_checkpoint", config.init_checkpoint, need)
     for name, team in {"algo": config.algo, "adversary": config.adversary}.items():
         if team is None:
@@ -125,6 +129,15 @@ def _check_team(name: str, team: "AlgoConfig", updates: int, need: Any) -> None:
         f"{name}.dropped_quantiles={team.dropped_quantiles} leaves none of {name}.critic_quantiles="
         f"{team.critic_quantiles}",
     )
+    need(
+        team.joint or not team.hands_over,
+        f"{name}.hands_over=true needs {name}.joint=true: an agent that takes the place of several",
+    )
+    for key, plain in (("critic_head", "scalar"), ("critic_norm", "none")):
+        need(
+            not team.hands_over or team.frozen or getattr(team, key) == plain,
+            f"{name}.{key}={getattr(team, key)}: {team.name}'s agents hand over critics with {key}={plain} alone",
+        )
     if team.critic_range is not None:
         first, last = team.critic_range
         need(first < last, f"{name}.critic_range=[{first},{last}]: the first number must be below the second")

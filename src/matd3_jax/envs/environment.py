@@ -1,6 +1,8 @@
 """The contract every environment keeps: what it is made of, how it resets and how it steps."""
 
 import abc
+import itertools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import chex
@@ -74,6 +76,12 @@ class Environment(abc.ABC):
     def full_observation_size(self) -> int:
         """Number of entries of `full_observation`."""
         return sum(self.observation_sizes)
+
+    @property
+    def entries_in_full_observation(self) -> tuple[tuple[int, ...], ...] | None:
+        """Where in `full_observation` each entry of each agent's observation is; None: it need not be in it."""
+        joint = type(self).full_observation is Environment.full_observation
+        return consecutive(self.observation_sizes) if joint else None
 
     @property
     def observation_names(self) -> tuple[tuple[str, ...], ...] | None:
@@ -154,6 +162,12 @@ class Environment(abc.ABC):
     def measure(self, state: Any) -> chex.Array:
         """Quantities of the env step that led to `state`, besides the rewards: [len(measures)]."""
         return jnp.zeros(len(self.measures))
+
+
+def consecutive(sizes: Sequence[int]) -> tuple[tuple[int, ...], ...]:
+    """Give the entries of each of several vectors of these sizes when they stand behind each other."""
+    ends = itertools.accumulate(sizes)
+    return tuple(tuple(range(end - size, end)) for end, size in zip(ends, sizes, strict=True))
 
 
 def check_choice(key: str, value: object, allowed: tuple[str, ...]) -> None:

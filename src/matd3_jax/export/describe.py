@@ -78,8 +78,11 @@ def _places(env: Environment, base: Any, agent: int) -> dict[str, Any]:
     partition = getattr(base, "partition", None)
     if partition is None:
         return {}
-    everything = range(base.full_observation_size)
-    return {"indices_in_full_observation": list(everything if env is not base else partition.observations[agent])}
+    if env is base:
+        return {"indices_in_full_observation": list(partition.observations[agent])}
+    if isinstance(env, JointTeam) and not env.full:
+        return {"indices_in_full_observation": [entry for one in partition.observations for entry in one]}
+    return {"indices_in_full_observation": list(range(base.full_observation_size))}
 
 
 def _controls(base: Any, agent: str, number: int, joined: bool) -> dict[str, Any]:

@@ -124,6 +124,13 @@ class PlaygroundTask(Environment):
         return int(np.prod(full.shape))
 
     @property
+    def entries_in_full_observation(self) -> tuple[tuple[int, ...], ...] | None:
+        shown = self._loaded.state.obs
+        if isinstance(shown, Mapping) and "privileged_state" in shown:
+            return None
+        return tuple(tuple(entries.tolist()) for entries in self.seen)
+
+    @property
     def measures(self) -> tuple[str, ...]:
         return tuple(name.replace("/", "_") for name in self._metrics)
 

@@ -3,19 +3,20 @@
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from matd3_jax.config import Config
 from matd3_jax.runs import divergence
 from matd3_jax.runs.directory import RunDirectory
+from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.runtime.terminal import say
 from matd3_jax.tracking.messages import FINISHED, STOPPED
 from matd3_jax.training import best as best_evaluations
-from matd3_jax.training import checkpoint, film, finish, host_states, starting
+from matd3_jax.training import checkpoint, film, finish, host_states, hybrid, starting
 from matd3_jax.training import run as training_run
 from matd3_jax.training.film import Filmer
 from matd3_jax.training.loggers import CallbackLogger, DivergenceLogger, Logger, TableLogger
@@ -27,6 +28,17 @@ from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import TrainState
 
 
+class Start(NamedTuple):
+    """Where a batch is trained from."""
+
+    state: TrainState
+    row: Row
+    row_is_new: bool = False
+    """Whether loggers have not had the row yet."""
+    save_first: bool = False
+    """Whether a checkpoint comes before anything else."""
+
+
 class Batch:
     """Runs that share one program.
 
@@ -36,6 +48,7 @@ class Batch:
         checkpoints: the folder of the batch's checkpoints.
         group: the name of the sweep, by which loggers group its runs.
         processes: which train it together.
+        keep_last: leave a checkpoint of all of it at its end.
     """
 
     def __init__(
@@ -46,7 +59,9 @@ class Batch:
         checkpoints: Path,
         group: str,
         processes: Processes = SINGLE_PROCESS,
+        keep_last: bool = False,
     ):
+        self.keep_last = keep_last
         self.title, self.runs, self.members = title, list(runs), list(members)
         self.checkpoints, self.group, self.processes = checkpoints, group, processes
         self.training = TrainingSession(self.members[0], members=self.members, processes=processes)
@@ -65,9 +80,11 @@ class Batch:
         training.check_memory(recorded=True)
         if self.processes.first:
             self._announce()
-        state, row, fresh = self._begin()
+        start = self._begin(stop)
+        if start is None:
+            return
         with self._outputs() as out:
-            self._train(stop, state, row, fresh, begun, out)
+            self._train(stop, start, begun, out)
 
     def _outputs(self) -> Outputs:
         """Where rows go besides the directories; nowhere from other processes than the first."""
@@ -75,12 +92,12 @@ class Batch:
         parts = self.runs[there], self.members[there], self.seeds[there]
         return Outputs(*parts, say, say, self.watch.diverged, self.group)
 
-    def _train(self, stop: Stop, state: TrainState, row: Row, fresh: bool, begun: float, out: Outputs) -> None:
-        training = self.training
+    def _train(self, stop: Stop, start: "Start", begun: float, out: Outputs) -> None:
+        training, row = self.training, start.row
         loggers: list[Logger] = []
         filmer = None
         if self.processes.first:
-            if fresh:
+            if start.row_is_new:
                 out.log(row)
             progress = ProgressBar(training, row, self.watch.diverged)
             loggers = [self.table, self.watch, progress, CallbackLogger(out.log)]
@@ -94,17 +111,19 @@ class Batch:
             tables = [run.metrics for run in self.runs]
             checkpoint.save(*to, keep=1, share=training.share, best=training.best, tables=tables)
 
-        outcome = training_run.run(training, state, row, loggers, save, stop, save_first=fresh, film=filmer)
+        outcome = training_run.run(training, start.state, row, loggers, save, stop, start.save_first, filmer)
         if outcome.stopped is not None:
             save(outcome.state, int(outcome.row["step"][0]))
             out.how = STOPPED
             return
+        if self.keep_last:
+            save(outcome.state, int(outcome.row["step"][0]))
         rates = progress.rates() if self.processes.first else {}
         self._finish(outcome.state, outcome.row, {"seconds": round(time.monotonic() - begun, 1), **rates}, out)
         out.how = FINISHED
 
-    def _begin(self) -> tuple[TrainState, Row, bool]:
-        """The state to train from, its row, and whether nothing was trained yet."""
+    def _begin(self, stop: Stop) -> "Start | None":
+        """What to train from; None where a signal came before."""
         first, broadcast = self.processes.first, self.processes.broadcast
         for run in self.runs if first else ():
             run.clean()
@@ -114,28 +133,61 @@ class Batch:
         if not broadcast(bool(checkpoint.steps(self.checkpoints)) if first else None):
             for run in self.runs if first else ():
                 run.clear()
+            if self.members[0].hands_over:
+                return self._after_the_agents(stop)
             given = [starting.of_directory(run.path) for run in self.runs]
             state, row = self.training.start(starting.joined(given))
             if first:
                 self.table.log(row)
                 self.watch.log(row)
-            return state, row, True
+            return Start(state, row, row_is_new=True, save_first=True)
         saved = Path(broadcast(str(checkpoint.verify(self.checkpoints)) if first else None))
         for line in host_states.notes(saved, self.training.trainer, unpickle=False, sweep=True) if first else ():
             say(line)
         training, done = self.training, int(saved.name)
         state = checkpoint.restore(saved, training.trainer, training.share, best=training.best)
         self.processes.barrier()
-        parts = zip(self.runs, self.members, self.seeds, strict=True)
-        for number, (run, config, own) in enumerate(parts) if first else ():
+        for number, (run, config) in enumerate(zip(self.runs, self.members, strict=True)) if first else ():
             for line in run.cut(done, self.training.expected_table(config), saved, number):
                 say(f"note: {line}")
-            known = divergence.of_run(run, done)
-            self.watch.diverged |= {own.start + seed - config.seed: found for seed, found in known.items()}
         if first:
+            self._note_diverged(done)
             say(f"resuming from the checkpoint of env step {done:,}")
         updates = self.training.trainer.updates(int(state.rollouts))
-        return state, {"step": np.array([done]), "updates": np.array([updates])}, False
+        return Start(state, {"step": np.array([done]), "updates": np.array([updates])})
+
+    def _after_the_agents(self, stop: Stop) -> "Start | None":
+        """Train the agents' parts of hybrid runs, and go on with one agent in their place."""
+        training, first = self.training, self.processes.first
+        settings = [hybrid.agents_settings(training, member) for member in self.members]
+        machine = {"versions": devices.versions(), **devices.description()}
+        for run, own in zip(self.runs, settings, strict=True) if first else ():
+            hybrid.prepare(run, own, machine)
+        self.processes.barrier()
+        runs = [RunDirectory(run.path / hybrid.FOLDER) for run in self.runs]
+        folder = self.checkpoints.with_name(hybrid.FOLDER)
+        part = Batch(f"{self.title}, {hybrid.FOLDER}", runs, settings, folder, self.group, self.processes, True)
+        finished = all(run.summary() is not None for run in runs) if first else None
+        if not self.processes.broadcast(finished):
+            part.train(stop)
+            if stop.agreed(self.processes) is not None:
+                return None
+        saved = Path(self.processes.broadcast(str(checkpoint.verify(folder)) if first else None))
+        state, done = hybrid.begin(training, part.training, saved), part.training.total_steps
+        for run in self.runs if first else ():
+            hybrid.write_table(training, part.training, run)
+        if first:
+            self._note_diverged(done)
+            say(f"one agent takes over at env step {done:,}")
+        updates = training.trainer.updates(int(state.rollouts))
+        row = {"step": np.array([done]), "updates": np.array([updates])}
+        return Start(state, row, save_first=True)
+
+    def _note_diverged(self, done: int) -> None:
+        """Note which seeds had diverged by env step `done`."""
+        for run, config, own in zip(self.runs, self.members, self.seeds, strict=True):
+            known = divergence.of_run(run, done)
+            self.watch.diverged |= {own.start + seed - config.seed: found for seed, found in known.items()}
 
     def _finish(self, state: TrainState, row: Row, facts: Mapping[str, Any], out: Outputs) -> None:
         """Leave each run as if it had been trained alone, but for its replay."""

@@ -21,7 +21,7 @@ from matd3_jax.runtime.signals import Stop
 from matd3_jax.runtime.terminal import say
 from matd3_jax.sweep import batching
 from matd3_jax.sweep.batch import Batch
-from matd3_jax.training import outputs, starting
+from matd3_jax.training import hybrid, outputs, starting
 from matd3_jax.training.memory import most_seeds
 from matd3_jax.training.session import TrainingSession
 
@@ -102,6 +102,8 @@ class Sweep:
                 shutil.rmtree(path)
         for config in settings.values():
             outputs.check(config)
+        for config in {batching.program(config): config for config in settings.values() if config.hands_over}.values():
+            hybrid.switch_step(TrainingSession(config))
         if any(config.on_divergence == "stop" for config in settings.values()):
             raise UserError(
                 "on_divergence=stop: a sweep's runs are trained side by side, and none ends the others; "
@@ -113,7 +115,10 @@ class Sweep:
         new = batching.batches(settings, existing, self.runs, lambda config: size * fitting_seeds(config, budget))
         machine = {"versions": devices.versions(), **devices.description()}
         runs = [config for batch in new for config in batch]
-        given = [starting.gather(TrainingSession(config)) if starting.needed(config) else {} for config in runs]
+        given = [
+            starting.gather(hybrid.first_session(TrainingSession(config), config)) if starting.needed(config) else {}
+            for config in runs
+        ]
         for config, leaves in zip(runs, given, strict=True):
             more = (lambda folder, leaves=leaves: starting.write(folder, leaves)) if leaves else None
             RunDirectory.create(self.runs / str(config.name), config, machine, more=more)

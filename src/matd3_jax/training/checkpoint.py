@@ -16,7 +16,7 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -219,30 +219,41 @@ def restore(
         raise UserError(f"{path} holds no replay: what a sweep leaves of a run can be evaluated, not resumed")
     share = share or SINGLE_PROCESS.share(trainer.num_seeds)
     small = _rebuild(trainer, path, share)
+    rows = restore_replay(path, trainer, share, int(small.rollouts))
+    if best is not None:
+        best.restore(path, share)
+    return host_states.restored(path, trainer, small._replace(replay=rows), share, unpickle)
+
+
+def restore_replay(
+    path: Path,
+    trainer: TrainLoop,
+    share: Share,
+    rollouts: int,
+    convert: Callable[[np.ndarray], np.ndarray] = lambda rows: rows,
+) -> jax.Array:
+    """The replay in the checkpoint at `path`, of so many rollouts, one seed at a time; convert: what its rows [rows,
+    row size] become. Raises UserError where it does not fit the trainer."""
+    filled, local = trainer.schedule.filled_rows(rollouts), []
     with ocp.StandardCheckpointer() as checkpointer:
-        filled = trainer.schedule.filled_rows(int(small.rollouts))
-        local = []
         for device, seeds in trainer.sharding.device_seeds():
             shape = (len(seeds), trainer.schedule.replay_capacity, trainer.layout.row_size)
             rows = jax.device_put(jnp.zeros(shape, jnp.float32, device=device), device)
             for index, seed in enumerate(seeds):
                 if not filled:
                     continue
-                one = np.asarray(checkpointer.restore(path / "replay" / str(share.first + seed))["rows"])
+                one = convert(np.asarray(checkpointer.restore(path / "replay" / str(share.first + seed))["rows"]))
                 if one.shape[0] > shape[1] or one.shape[0] < filled or one.shape[1] != shape[2]:
                     raise UserError(f"{path}: a replay of shape {one.shape} does not fit these settings")
                 rows = _put_rows(rows, jax.device_put(one[None], device), index)
             local.append(rows)
     shape = (trainer.sharding.padded_seeds, trainer.schedule.replay_capacity, trainer.layout.row_size)
-    rows = jax.make_array_from_single_device_arrays(shape, trainer.shardings.replay, local)
-    if best is not None:
-        best.restore(path, share)
-    return host_states.restored(path, trainer, small._replace(replay=rows), share, unpickle)
+    return jax.make_array_from_single_device_arrays(shape, trainer.shardings.replay, local)
 
 
-def restore_actors(path: Path, trainer: TrainLoop) -> TrainState:
-    """The state without its replay (an empty one instead): enough to evaluate."""
-    return _rebuild(trainer, path, SINGLE_PROCESS.share(trainer.num_seeds))
+def restore_actors(path: Path, trainer: TrainLoop, share: Share | None = None) -> TrainState:
+    """The state without its replay (an empty one instead): enough to evaluate. share: as for `restore`."""
+    return _rebuild(trainer, path, share or SINGLE_PROCESS.share(trainer.num_seeds))
 
 
 def read_state(path: Path, first: int, last: int, total: int) -> dict[str, np.ndarray]:

@@ -5,13 +5,14 @@ import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from matd3_jax import config
 from matd3_jax.config import Config
 from matd3_jax.envs.environment import Environment
+from matd3_jax.envs.wrappers.joint_team import innermost
 from matd3_jax.errors import UserError
 from matd3_jax.runs import divergence, lock
 from matd3_jax.runs.directory import RunDirectory
@@ -20,7 +21,7 @@ from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.tracking.messages import FAILED, FINISHED, STOPPED
-from matd3_jax.training import announcement, best, checkpoint, finish, host_states, outputs, starting
+from matd3_jax.training import announcement, best, checkpoint, finish, host_states, hybrid, outputs, starting
 from matd3_jax.training.film import Filmer
 from matd3_jax.training.loggers import CallbackLogger, DivergenceLogger, Logger, TableLogger, warn
 from matd3_jax.training.outputs import Outputs
@@ -52,6 +53,7 @@ class Recorder:
             reported by a RuntimeWarning.
         loggers: get the rows of the metrics table, films, figures and the summary, too; their errors end no run.
         callback: gets the rows; its errors do.
+        stop: signals that somebody heeds already, to be heeded here, too.
     """
 
     def __init__(
@@ -61,9 +63,10 @@ class Recorder:
         say: Say | None = None,
         loggers: Sequence[Logger] = (),
         callback: Callable[[Row], object] | None = None,
+        stop: Stop | None = None,
     ):
         self.processes, self.loggers, self.callback = processes, loggers, callback
-        self.heed_signals = heed_signals
+        self.heed_signals, self.stop = heed_signals, stop
         self.say: Say = say if say is not None and processes.first else lambda line: None
         self.shows_progress = say is not None
         self.path: Path | None = None
@@ -78,15 +81,14 @@ class Recorder:
         Raises UserError where the run is impossible, before anything is written.
         """
         training = self._checked(settings, env)
-        given = starting.gather(training)
+        given = starting.gather(hybrid.first_session(training, settings) if settings.hands_over else training)
         if self.processes.first:
             RunDirectory.check_new(path, or_another)
         self.processes.barrier()  # nothing is written before all processes have found that they can train
         stop = self._stop()
-        machine = {"versions": devices.versions(), **self.processes.description()}
         more = (lambda folder: starting.write(folder, given)) if given else None
         if self.processes.first:
-            path = RunDirectory.create(path, settings, machine, or_another, more).path
+            path = RunDirectory.create(path, settings, self._machine, or_another, more).path
         directory = RunDirectory(self.processes.same_directory(path))
         self.path = directory.path
         with self._held(directory):
@@ -99,6 +101,7 @@ class Recorder:
         total_steps: int | None = None,
         env: Environment | None = None,
         unpickle: bool = False,
+        untouched: bool = False,
     ) -> Recorded:
         """Train a run on from its last checkpoint, or from that of env step `step`; from the start where it has none.
 
@@ -108,6 +111,7 @@ class Recorder:
             total_steps: env steps of each seed from now on; None: as before.
             env: of a run whose environment was given as an object.
             unpickle: of environments on the host (see `checkpoint.restore`).
+            untouched: nothing has been trained yet, and nobody is told so.
 
         Raises UserError where there is no run, it has come to its end, or the checkpoint is damaged.
         """
@@ -123,7 +127,8 @@ class Recorder:
             stop = self._stop()
             there = bool(checkpoint.steps(directory.checkpoints)) if self.processes.first else None
             if not self.processes.broadcast(there) and step is None:
-                self.say("no checkpoint yet: this run starts again")
+                if not (untouched or hybrid.begun(directory)):
+                    self.say("no checkpoint yet: this run starts again")
                 if self.processes.first:
                     directory.clear()
                 return self._from_the_start(training, directory, stop)
@@ -138,10 +143,16 @@ class Recorder:
         training = TrainingSession(settings, env, processes=self.processes)
         training.check_memory(recorded=True)
         outputs.check(settings)
+        if settings.hands_over:
+            self._checked(hybrid.agents_settings(training, settings), innermost(training.env))
         return training
 
+    @property
+    def _machine(self) -> dict[str, Any]:
+        return {"versions": devices.versions(), **self.processes.description()}
+
     def _stop(self) -> Stop | None:
-        return Stop() if self.heed_signals else None
+        return Stop() if self.heed_signals else self.stop
 
     @contextlib.contextmanager
     def _held(self, directory: RunDirectory) -> Iterator[None]:
@@ -155,12 +166,31 @@ class Recorder:
     def _from_the_start(self, training: TrainingSession, directory: RunDirectory, stop: Stop | None) -> Recorded:
         for line in announcement.first_lines(training, directory) if self.processes.first else ():
             self.say(line)
+        if training.config.hands_over:
+            return self._after_the_agents(training, directory, stop)
         state, row = training.start(starting.of_directory(directory.path))
         watch = self._watch(training, {})
         if self.processes.first:
             directory.append(row)
             watch.log(row)
         return self._to_the_end(training, directory, state, row, stop, watch, fresh=True)
+
+    def _after_the_agents(self, training: TrainingSession, directory: RunDirectory, stop: Stop | None) -> Recorded:
+        """Train the agents in a run directory of their own, then the one agent that takes over from them."""
+        rows = [CallbackLogger(logger.log) for logger in self.loggers]  # closed when the one agent is trained, too
+        part = Recorder(self.processes, False, self.say if self.shows_progress else None, rows, self.callback, stop)
+        part_of, outcome = hybrid.train_agents(part, training, directory, self._machine)
+        if outcome is not None and not outcome.finished:
+            return Recorded(directory, part_of, outcome)
+        del outcome  # its replay
+        saved = hybrid.last_checkpoint(directory, self.processes)
+        state, done = hybrid.begin(training, part_of, saved), part_of.total_steps
+        if self.processes.first:
+            hybrid.write_table(training, part_of, directory)
+        self.say(f"one agent takes over at env step {done:,}")
+        row = {"step": np.array([done]), "updates": np.array([training.trainer.updates(int(state.rollouts))])}
+        watch = self._watch(training, self._diverged(training, directory, state, done))
+        return self._to_the_end(training, directory, state, row, stop, watch, save_first=True)
 
     @property
     def _tell(self) -> Say:
@@ -248,10 +278,11 @@ class Recorder:
         stop: Stop | None,
         watch: DivergenceLogger,
         fresh: bool = False,
+        save_first: bool = False,
     ) -> Recorded:
         """Train to the end, or until a signal comes or a seed diverges that must not."""
         with self._outputs(training, directory, watch) as out:
-            return self._trained(training, directory, state, row, stop, watch, fresh, out)
+            return self._trained(training, directory, state, row, stop, watch, fresh, fresh or save_first, out)
 
     def _trained(
         self,
@@ -262,6 +293,7 @@ class Recorder:
         stop: Stop | None,
         watch: DivergenceLogger,
         fresh: bool,
+        save_first: bool,
         out: Outputs,
     ) -> Recorded:
         settings, begun = training.config, time.monotonic()
@@ -288,7 +320,7 @@ class Recorder:
             to = directory.checkpoints, step, training.trainer, state, keep
             checkpoint.save(*to, share=training.share, best=training.best, tables=[directory.metrics])
 
-        outcome = run(training, state, row, loggers, save, stop, save_first=fresh, film=film)
+        outcome = run(training, state, row, loggers, save, stop, save_first, film)
         step = int(outcome.row["step"][0])
         save(outcome.state, step)
         if self.processes.first:

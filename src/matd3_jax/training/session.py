@@ -23,7 +23,7 @@ from matd3_jax.runs import overestimation
 from matd3_jax.runs.missing import Expected
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
-from matd3_jax.training import memory, rows, starting
+from matd3_jax.training import handover, memory, rows, starting
 from matd3_jax.training.best import BestPolicies
 from matd3_jax.training.clock import Clock
 from matd3_jax.training.evaluator import Evaluator
@@ -74,13 +74,21 @@ class TrainingSession:
                 "stepped in Python and only goes forward: leave it false"
             )
         teams = config.teams()
+        if base.on_host and config.hands_over:
+            raise UserError(
+                f"algo=hybrid lets episodes go on with another environment, and {config.env['name']} is stepped in "
+                "Python: train algo=matd3, then algo=td3 with init="
+            )
         if config.adversary is not None and "adversaries" not in base.teams:
             raise UserError(f"adversary={config.adversary.name}: {config.env['name']} has no adversaries")
         joint = tuple(team for team in dict.fromkeys(base.teams) if teams[team].joint)
+        algorithms = {team: algo.algorithm() for team, algo in teams.items()}
         for team in joint:
-            base = JointTeam(base, (team,))
+            if teams[team].hands_over:
+                algorithms[team] = handover.widened(algorithms[team], base.teams.count(team))
+            base = JointTeam(base, (team,), full=not teams[team].hands_over)
         self.env = base
-        self.layout = JointLayout.of(self.env, {team: algo.algorithm() for team, algo in teams.items()}, config.n_step)
+        self.layout = JointLayout.of(self.env, algorithms, config.n_step)
         schedule = Schedule(
             num_envs=config.num_envs,
             rollout_length=config.rollout_length,

@@ -18,7 +18,7 @@ from matd3_jax.envs.environment import Environment
 from matd3_jax.envs.wrappers.joint_team import innermost
 from matd3_jax.errors import UserError
 from matd3_jax.runs.directory import RunDirectory
-from matd3_jax.training import saved_policies
+from matd3_jax.training import handover, saved_policies
 from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import TrainState
 
@@ -145,8 +145,11 @@ def of(settings: Config, training: TrainingSession) -> "Leaves":
         elif init is not None:
             members = []
             for name, number in zip(names, group.members, strict=True):
-                _check_actions(init, layout, number)
-                found = init.networks(name)
+                if _hands_over(init, name):
+                    found = _handed_over(init, layout, number)
+                else:
+                    _check_actions(init, layout, number)
+                    found = init.networks(name)
                 if wanted.actor_average is None:
                     found = found._replace(actor_average=None)
                 elif found.actor_average is None:
@@ -159,7 +162,9 @@ def of(settings: Config, training: TrainingSession) -> "Leaves":
             groups.append(_nothing(GroupState))
     start = _nothing(TrainState)._replace(groups=tuple(groups))
     if init is not None and settings.normalize_observations:
-        parts = [init.part(init.state.statistics, name) for name in layout.agents]  # type: ignore[arg-type]
+        parts = [
+            _statistics(init, name, size) for name, size in zip(layout.agents, layout.observation_sizes, strict=True)
+        ]
         joint = Statistics(*(np.concatenate(leaves, axis=-1) for leaves in zip(*parts, strict=True)))
         rollouts = int(init.state.rollouts) + np.zeros(len(seeds), np.float32)
         if init.state.earlier is not None:
@@ -167,6 +172,30 @@ def of(settings: Config, training: TrainingSession) -> "Leaves":
         there, here = init.training.trainer.schedule.rollout_steps, training.trainer.schedule.rollout_steps
         start = start._replace(statistics=joint, earlier=(rollouts * (there / here)).astype(np.float32))
     return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_flatten_with_path(start)[0]}
+
+
+def _hands_over(source: Source, name: str) -> bool:
+    """Whether an agent is one in the place of a team whose agents learned there."""
+    return name not in source.layout.agents and name in source.layout.teams
+
+
+def _handed_over(source: Source, layout: JointLayout, agent: int) -> GroupState:
+    """The networks of the agents of a team as those of one agent in their place."""
+    team = handover.Team.of(source.name, layout.agents[agent], source.layout, source.training.env)
+    each = [source.networks(source.layout.agents[i]) for i in team.agents]
+    return handover.networks(source.name, team, each, source.layout, layout, agent)
+
+
+def _statistics(source: Source, name: str, size: int) -> Statistics:
+    """The statistics of what an agent sees, `size` entries."""
+    there = source.state.statistics
+    assert there is not None
+    if not _hands_over(source, name):
+        return source.part(there, name)
+    team = handover.Team.of(source.name, name, source.layout, source.training.env)
+    return handover.statistics(
+        source.name, team, [source.part(there, source.layout.agents[i]) for i in team.agents], size
+    )
 
 
 def _frozen(

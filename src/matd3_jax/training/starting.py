@@ -38,6 +38,10 @@ def needed(settings: Config) -> bool:
 def lines(settings: Config) -> list[str]:
     """What is said of it before a run trains."""
     found = []
+    if settings.hands_over:
+        found.append(
+            "first the agents learn, each with its own networks, then one agent in their place goes on with these"
+        )
     if settings.init is not None:
         found.append(
             f"begins with the networks and statistics of {settings.init} "

@@ -1,6 +1,7 @@
 """`matd3_jax.train` and `matd3_jax.resume`: runs from Python."""
 
 import dataclasses
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -92,6 +93,10 @@ def train(
         config = dataclasses.replace(config, env={"name": type(own).__name__})
     if run_dir is not None:
         return _result(_recorder(loggers, callback).start(config, Path(run_dir), own))
+    if config.hands_over:  # the one agent begins with a checkpoint of the agents
+        with tempfile.TemporaryDirectory() as folder:
+            found = _result(_recorder(loggers, callback).start(config, Path(folder) / "run", own))
+        return dataclasses.replace(found, run_dir=None)
     outputs.check(config, recorded=False)
     every: list[Logger] = [outputs.Harmless(logger, warn) for logger in loggers]
     every += [] if callback is None else [CallbackLogger(callback)]

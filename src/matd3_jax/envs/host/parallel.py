@@ -8,6 +8,7 @@ import chex
 import jax.numpy as jnp
 import numpy as np
 
+from matd3_jax.envs.environment import consecutive
 from matd3_jax.envs.host import sources
 from matd3_jax.envs.host.environment import HostState
 from matd3_jax.envs.host.made import MadeEnvironment
@@ -82,6 +83,10 @@ class _Parallel(MadeEnvironment[Facts]):
     @property
     def full_observation_size(self) -> int:
         return self.facts.state_size or sum(self.facts.sizes)
+
+    @property
+    def entries_in_full_observation(self) -> tuple[tuple[int, ...], ...] | None:
+        return None if self.facts.state_size else consecutive(self.facts.sizes)
 
     @property
     def num_rewards(self) -> int:

@@ -88,6 +88,10 @@ class _Single(MadeEnvironment[Facts]):
         return (1 / len(self.agents),) * len(self.agents)
 
     @property
+    def entries_in_full_observation(self) -> tuple[tuple[int, ...], ...]:
+        return self.observed
+
+    @property
     def full_observation_size(self) -> int:
         return self.facts.size
 

@@ -90,6 +90,10 @@ class BraxRobot(Environment):
         return (1 / len(self.agents),) * len(self.agents)
 
     @property
+    def entries_in_full_observation(self) -> tuple[tuple[int, ...], ...]:
+        return self.partition.observations
+
+    @property
     def full_observation_size(self) -> int:
         return models.layout(self.robot).size
 

@@ -128,6 +128,10 @@ class Robot(Environment):
         return (1 / len(self.agents),) * len(self.agents)
 
     @property
+    def entries_in_full_observation(self) -> tuple[tuple[int, ...], ...]:
+        return self.partition.observations
+
+    @property
     def full_observation_size(self) -> int:
         return self.layout.size
 

@@ -16,16 +16,17 @@ class JointTeam(Environment):
     """`env` with all agents of `teams` (one name or several) joined into one agent.
 
     The joined agent stands where its first member stood and bears the name of its team (names joined by "+"). It sees
-    `env.full_observation` if it is everybody, otherwise its members' observations behind each other. Its action is
-    theirs behind each other: Simplex with all parts, Box of the summed size, MultiDiscrete for integers. Its reward is
-    the mean of theirs and its return weight the sum of theirs, so that the return of the team stays what it was where
-    the members share their reward. The state is the wrapped environment's.
+    `env.full_observation` if it is everybody and `full`, otherwise its members' observations behind each other. Its
+    action is theirs behind each other: Simplex with all parts, Box of the summed size, MultiDiscrete for integers. Its
+    reward is the mean of theirs and its return weight the sum of theirs, so that the return of the team stays what it
+    was where the members share their reward. The state is the wrapped environment's.
 
     Raises OptionError for an unknown team, and where the members' action spaces do not fit into one.
     """
 
     env: Environment
     teams_joined: tuple[str, ...] | str = "agents"
+    full: bool = True
 
     def __post_init__(self) -> None:
         teams = (self.teams_joined,) if isinstance(self.teams_joined, str) else tuple(self.teams_joined)
@@ -53,7 +54,7 @@ class JointTeam(Environment):
     @property
     def observation_sizes(self) -> tuple[int, ...]:
         sizes = self.env.observation_sizes
-        joined = self.env.full_observation_size if self._everybody else sum(sizes[i] for i in self.members)
+        joined = self.env.full_observation_size if self._sees_all else sum(sizes[i] for i in self.members)
         return self._replace(sizes, joined)
 
     @property
@@ -77,7 +78,7 @@ class JointTeam(Environment):
     @property
     def observation_names(self) -> tuple[tuple[str, ...], ...] | None:
         names = self.env.observation_names
-        if names is None or self._everybody:
+        if names is None or self._sees_all:
             whole = self.env.full_observation_names
             return None if whole is None or names is None else (whole,)
         joined = tuple(f"{self.env.agents[i]}: {name}" for i in self.members for name in names[i])
@@ -137,7 +138,7 @@ class JointTeam(Environment):
 
     def join(self, state: Any, observation: tuple[chex.Array, ...]) -> tuple[chex.Array, ...]:
         """What this one's agents see, of what the wrapped environment's see in `state`."""
-        if self._everybody:
+        if self._sees_all:
             return (self.env.full_observation(state),)
         return self._replace(observation, jnp.concatenate([observation[i] for i in self.members]))
 
@@ -163,8 +164,8 @@ class JointTeam(Environment):
         return "+".join(self.teams_joined)
 
     @property
-    def _everybody(self) -> bool:
-        return len(self.members) == len(self.env.agents)
+    def _sees_all(self) -> bool:
+        return self.full and len(self.members) == len(self.env.agents)
 
     def _replace(self, items: tuple, joined: Any) -> tuple:
         """`items` with `joined` for the first member and without the other members."""
