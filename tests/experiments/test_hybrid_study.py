@@ -1,0 +1,68 @@
+"""The report of `experiments.hybrid`: what it says of given runs."""
+
+import csv
+
+import numpy as np
+import pictures
+import pytest
+
+from experiments import hybrid
+from matd3_jax import config
+from matd3_jax.runs.directory import RunDirectory
+
+STEPS = (0, 10, 20, 30, 40, 50, 60, 70, 80, 90, 100)
+
+
+def curve(name, steps):
+    """MATD3 is early and ends at 50, TD3 late at 90, the hybrid as the one before step 30 and rises to 100."""
+    early, late = np.minimum(2.0 * steps, 50), np.maximum(2.0 * steps - 110, 0)
+    return {"MATD3": early, "TD3": late, "TD3, as wide": late + 1, "hybrid": np.where(steps <= 30, early, steps)}[name]
+
+
+@pytest.fixture
+def runs(tmp_path):
+    options, folder = hybrid.HybridOptions(scale="small"), tmp_path / "runs"
+    for name, (label, line) in zip(hybrid.COLORS, hybrid.settings("small", options).items(), strict=True):
+        run = RunDirectory.create(folder / label, config.load([*line, "seeds=2"]), {"cores": 2})
+        for step in STEPS:
+            returns = curve(name, np.float64(step)) + np.array([-1.0, 1.0])
+            run.append(
+                {
+                    "step": np.full(2, step),
+                    "seed": np.arange(2),
+                    "updates": np.full(2, step),
+                    "return_agents": np.zeros(2),
+                    "eval_return_agents": returns,
+                    "eval_forward_velocity": returns / 100,
+                }
+            )
+        run.write_summary({"total_steps": 100})
+    return folder
+
+
+def test_settings_differ_in_nothing_but_the_algorithm_and_its_width():
+    found = hybrid.settings("small", hybrid.HybridOptions(scale="small"))
+    loaded = {label: config.load(line) for label, line in found.items()}
+    assert list(loaded) == ["matd3", "hybrid", "td3", "td3_wide"]
+    assert loaded["hybrid"].switch_at == 60_000 and loaded["hybrid"].total_steps == 200_000
+    assert [one.algo.hidden for one in loaded.values()] == [(128, 128), (128, 128), (128, 128), (256, 256)]
+    assert {(one.seeds, one.total_steps, one.batch_size, one.recipe) for one in loaded.values()} == {
+        (5, 200_000, 512, "fast")
+    }
+
+
+def test_report(runs, tmp_path, monkeypatch):
+    figures = pictures.written(monkeypatch)
+    out = tmp_path / "out"
+    assert hybrid.main(["scale=small", "train=false", f"runs={runs}", f"out={out}", "seeds=2"]) == 0
+    with (out / "curves.csv").open(newline="") as file:
+        assert len(list(csv.DictReader(file))) == 4 * 2 * len(STEPS)
+    table = (out / "table.md").read_text()
+    # Before the switch: the mean of 0, 20, 40, 50 against 0; late: of 70 to 100, against 50 and against 2 s - 110.
+    assert (
+        "27.5" in table and "| hybrid | 2 | 100 | 100 ± 1 " in table and "| TD3, as wide | 2 | 100 | 91 ± 1 " in table
+    )
+    assert table.count("**same**") == 5, table
+    axes = figures[out / "curves.png"].axes
+    assert [label.split(" (")[0] for label in pictures.lines(axes[0])][:4] == list(hybrid.COLORS)
+    np.testing.assert_allclose(pictures.lines(axes[0])["hybrid (2 seeds)"][1], curve("hybrid", np.array(STEPS)))
