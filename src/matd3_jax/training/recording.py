@@ -86,9 +86,10 @@ class Recorder:
             RunDirectory.check_new(path, or_another)
         self.processes.barrier()  # nothing is written before all processes have found that they can train
         stop = self._stop()
+        machine = self._machine()
         more = (lambda folder: starting.write(folder, given)) if given else None
         if self.processes.first:
-            path = RunDirectory.create(path, settings, self._machine, or_another, more).path
+            path = RunDirectory.create(path, settings, machine, or_another, more).path
         directory = RunDirectory(self.processes.same_directory(path))
         self.path = directory.path
         with self._held(directory):
@@ -147,8 +148,8 @@ class Recorder:
             self._checked(hybrid.agents_settings(training, settings), innermost(training.env))
         return training
 
-    @property
     def _machine(self) -> dict[str, Any]:
+        """What machine.json says; asked by all processes together."""
         return {"versions": devices.versions(), **self.processes.description()}
 
     def _stop(self) -> Stop | None:
@@ -179,7 +180,7 @@ class Recorder:
         """Train the agents in a run directory of their own, then the one agent that takes over from them."""
         rows = [CallbackLogger(logger.log) for logger in self.loggers]  # closed when the one agent is trained, too
         part = Recorder(self.processes, False, self.say if self.shows_progress else None, rows, self.callback, stop)
-        part_of, outcome = hybrid.train_agents(part, training, directory, self._machine)
+        part_of, outcome = hybrid.train_agents(part, training, directory, self._machine())
         if outcome is not None and not outcome.finished:
             return Recorded(directory, part_of, outcome)
         del outcome  # its replay
