@@ -13,6 +13,8 @@ from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.runtime.terminal import say
+from matd3_jax.sweep.lineage import FILE as LINEAGE
+from matd3_jax.sweep.population import Population, Rules
 from matd3_jax.tracking.messages import FINISHED, STOPPED
 from matd3_jax.training import best as best_evaluations
 from matd3_jax.training import checkpoint, film, finish, host_states, starting
@@ -36,6 +38,8 @@ class Batch:
         checkpoints: the folder of the batch's checkpoints.
         group: the name of the sweep, by which loggers group its runs.
         processes: which train it together.
+        population: its runs are the members of populations.
+        lineage: the file of these.
     """
 
     def __init__(
@@ -46,6 +50,8 @@ class Batch:
         checkpoints: Path,
         group: str,
         processes: Processes = SINGLE_PROCESS,
+        population: Rules | None = None,
+        lineage: Path = Path(LINEAGE),
     ):
         self.title, self.runs, self.members = title, list(runs), list(members)
         self.checkpoints, self.group, self.processes = checkpoints, group, processes
@@ -58,6 +64,9 @@ class Batch:
             say,
             names=[f"{c.name}: seed {seed}" for c in self.members for seed in c.seed_numbers],
         )
+        self.population = None
+        if population is not None:
+            self.population = Population(population, self.training, self.watch.diverged, lineage)
 
     def train(self, stop: Stop) -> None:
         """From the last checkpoint, or from the start, to the end or until a signal comes."""
@@ -92,9 +101,11 @@ class Batch:
                 run.sync()
             to = self.checkpoints, step, training.trainer, state
             tables = [run.metrics for run in self.runs]
-            checkpoint.save(*to, keep=1, share=training.share, best=training.best, tables=tables)
+            more = None if self.population is None else self.population.write
+            checkpoint.save(*to, keep=1, share=training.share, best=training.best, tables=tables, more=more)
 
-        outcome = training_run.run(training, state, row, loggers, save, stop, save_first=fresh, film=filmer)
+        start, change = (training, state, row), self.population
+        outcome = training_run.run(*start, loggers, save, stop, save_first=fresh, film=filmer, change=change)
         if outcome.stopped is not None:
             save(outcome.state, int(outcome.row["step"][0]))
             out.how = STOPPED
@@ -119,18 +130,23 @@ class Batch:
             if first:
                 self.table.log(row)
                 self.watch.log(row)
+            if self.population is not None:
+                self.population.begin(row)
             return state, row, True
         saved = Path(broadcast(str(checkpoint.verify(self.checkpoints)) if first else None))
         for line in host_states.notes(saved, self.training.trainer, unpickle=False, sweep=True) if first else ():
             say(line)
         training, done = self.training, int(saved.name)
         state = checkpoint.restore(saved, training.trainer, training.share, best=training.best)
+        if self.population is not None:
+            self.population.restore(saved)
         self.processes.barrier()
         parts = zip(self.runs, self.members, self.seeds, strict=True)
         for number, (run, config, own) in enumerate(parts) if first else ():
             for line in run.cut(done, self.training.expected_table(config), saved, number):
                 say(f"note: {line}")
-            known = divergence.of_run(run, done)
+            copied = None if self.population is None else self.population.lineage.copied().get(str(config.name))
+            known = divergence.of_run(run, done, copied)
             self.watch.diverged |= {own.start + seed - config.seed: found for seed, found in known.items()}
         if first:
             say(f"resuming from the checkpoint of env step {done:,}")
@@ -153,6 +169,7 @@ class Batch:
             }
             settings = str(config.name), config.diagnostics.q_bias
             own_facts = {**facts, **best_evaluations.summary(saved, config.seed_numbers)}
+            own_facts |= {} if self.population is None else self.population.facts(number)
             found = finish.finish(run, self.training.layout, *settings, done, own_facts, diverged)
             out.finish(number, found)
 
