@@ -1,8 +1,9 @@
 """Selection and exploration against the rules written down again, the lineage by hand, and what cannot be a
-population."""
+population. Nothing is trained here."""
 
 import collections
 import itertools
+import types
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from matd3_jax.sweep.lineage import Lineage, Stage, lines
 from matd3_jax.sweep.population import Rules
 from matd3_jax.sweep.runner import Sweep
 from matd3_jax.sweep.search_space import SearchSpace
+from matd3_jax.training.copying import Copier
 
 TINY = [
     "env=point_reach", "algo=iddpg", "algo.hidden=[4]", "batch_size=8", "num_envs=2", "learning_starts=100",
@@ -104,6 +106,68 @@ def test_resampled_values_are_anywhere_in_the_search_space():
     assert min(collections.Counter(tau for _, tau in drawn).values()) > 70
     near = {population.explored(axes, ("0.001", "0.02"), "perturb", rng) for _ in range(100)}
     assert near == set(itertools.product(("0.0008", "0.0012"), ("0.01", "0.05")))  # each key by itself
+
+
+# ---- along training --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def stub(tmp_path, monkeypatch):
+    """(makes the two populations of three members of a batch that does not train, what was copied, the rates that were
+    set, who has diverged)."""
+    copied, rates, diverged = [], [], {}
+    monkeypatch.setattr(Copier, "copy", lambda self, state, *more: copied.append(more) or state)
+
+    def change(each):
+        rates.append([config.algo.critic_lr for config in each])
+
+    training = types.SimpleNamespace(
+        members=[types.SimpleNamespace(name=name) for name in "abc"], trainer=None, total_steps=1000,
+        config=types.SimpleNamespace(seed_numbers=range(5, 7)), change_hyper=change,
+        env=types.SimpleNamespace(on_host=False),
+    )  # fmt: skip
+    settings = {name: {"algo.lr": value} for name, value in zip("abc", ("0.1", "0.2", "0.4"), strict=True)}
+    overrides = (*TINY, "algo.lr=interval(0.01,1)")
+    rules = Rules(100, 0.2, "perturb", False, 3, overrides, "return_agents", settings)
+    return lambda: population.Population(rules, training, diverged, tmp_path / "pbt.csv"), copied, rates, diverged
+
+
+def row(step, *returns):
+    return {"step": np.full(6, step), "return_agents": np.array(returns)}
+
+
+def test_who_ended_no_episode_keeps_the_last_score_also_after_a_resume(stub, tmp_path):
+    make, copied, rates, _ = stub
+    nothing, own = np.nan, make()
+    own.begin(row(40, 1, nothing, 2, 5, 3, 6))  # settings first: a a b b c c
+    assert own("state", row(90, nothing, 4, nothing, nothing, nothing, nothing), 40) == "state" and not copied
+    again = make()
+    again.restore(own.write(tmp_path).parent)
+    for one in (own, again):
+        copied.clear()
+        one("state", row(140, nothing, nothing, 0.5, 5, nothing, nothing), 90)
+        assert [sources for sources, *_ in copied] == [{2: 4, 1: 5}]  # b copies c, a copies c
+        np.testing.assert_array_equal(one.scores, [[1, 6], [3, 5], [3, 6]])
+        np.testing.assert_array_equal(one.lineage.scores[1], [[1, 4], [0.5, 5], [3, 6]])
+    assert own.lineage.table() == again.lineage.table() and rates[1] == rates[2]
+    np.testing.assert_allclose(rates[0], [0.1, 0.1, 0.2, 0.2, 0.4, 0.4])  # at the resume
+    for place, rate in enumerate(rates[1]):
+        assert rate in ((0.32, 0.48) if place in (1, 2) else (rates[0][place],))
+    own("state", row(1000, 1, 2, 3, 4, 5, 6), 990)  # nothing would follow
+    assert len(copied) == 1 and len(rates) == 3
+
+
+def test_who_diverged_takes_replay_and_environments_too_and_is_forgiven(stub):
+    make, copied, _, diverged = stub
+    own = make()
+    own.begin(row(40, 1, 2, 3, 4, 5, 6))
+    diverged |= {4: None}
+    own("state", row(100, 1, 2, 3, 4, np.nan, 6), 40)
+    assert copied == [({4: 2, 1: 5}, [4], [4])] and diverged == {}
+    assert np.isnan(own.lineage.scores[1][2, 0]) and own.lineage.copied() == {"c": {5: 100}, "a": {6: 100}}
+    damaged = make()
+    with pytest.raises(UserError, match="cannot read the population in"):
+        damaged.restore(own.path.parent / "none")
 
 
 # ---- lineage ---------------------------------------------------------------------------------------------------------
