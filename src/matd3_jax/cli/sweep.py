@@ -241,12 +241,12 @@ def _lineage(sweep: Sweep) -> Lineage | None:
 def _report_population(folder: Path, lineage: Lineage, rows: Sequence[Ranked], metric: str) -> None:
     """Figure of the lineage, the best member of each population, and the schedule that the best of all had."""
     lineage_figure.draw(folder / "pbt.png", lineage, metric)
+    say(f"lineage: {folder / lineages.FILE}, {folder / 'pbt.png'}")
     best = ranking.best_members(rows)
     if not best:
         return
     mean, half = mean_interval(np.array([value for value, _ in best.values()]))
-    say(f"lineage: {folder / lineages.FILE}, {folder / 'pbt.png'}\n"
-        f"best member of each population ({len(best)}), final: {plus_minus(mean, half)}")  # fmt: skip
+    say(f"best member of each population ({len(best)}), final: {plus_minus(mean, half)}")
     seed, (value, name) = max(best.items(), key=lambda one: one[1][0])
     say(f"hyper-parameters of the best, {name} seed {seed} ({value:.4g}), or of those that it copied:")
     stages = lineage.schedule(lineage.settings.index(name), lineage.seeds.index(seed))

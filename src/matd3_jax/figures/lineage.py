@@ -23,8 +23,9 @@ SLANT = 0.4
 def draw(path: Path, lineage: Lineage, metric: str) -> None:
     """A column for each population: above the scores, the best one in blue, below each swept key.
 
-    A member is a line at its value, colored by its score at the selection that follows; a thin black line leads from
-    the value of the member that was copied to the new value of the one that copied it.
+    A member is a line at its value, colored by its score at the selection that follows, or in vermilion where it had
+    diverged by then; a thin black line leads from the value of the member that was copied to the new value of the one
+    that copied it.
     """
     shown = min(MOST, len(lineage.seeds))
     rows = 1 + len(lineage.keys)
@@ -47,8 +48,11 @@ def draw(path: Path, lineage: Lineage, metric: str) -> None:
         axis.set_ylabel(key)
     mapped = figure.colorbar(_mappable(norm), ax=axes[1:].ravel().tolist(), fraction=0.03, extend="min")
     mapped.set_label(metric)
-    more = f" (the first {shown} of {len(lineage.seeds)} populations)" if shown < len(lineage.seeds) else ""
-    figure.suptitle(f"{len(lineage.settings)} members, {len(lineage.steps) - 1} selections{more}", fontsize=10)
+    count = len(lineage.steps) - 1
+    title = f"{len(lineage.settings)} members, {count} selection{'s' * (count != 1)}"
+    title += f" (the first {shown} of {len(lineage.seeds)} populations)" if shown < len(lineage.seeds) else ""
+    title += "; vermilion: diverged" if np.isnan(scores[1:, :, :shown]).any() else ""
+    figure.suptitle(title, fontsize=10)
     style.save(figure, path, dpi=130)
 
 

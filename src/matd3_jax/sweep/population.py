@@ -244,9 +244,14 @@ def check(rules: Rules, settings: Mapping[str, Config]) -> None:
                     f"differ in {', '.join(HYPER_PARAMS)} alone, and not in whether there is any target noise, "
                     "adversarial step or range of exploration noise"
                 )
-    steps = settings[first].total_steps
-    if rules.every >= steps:
-        raise UserError(f"pbt_every={rules.every} is not below total_steps={steps}: nobody would ever copy")
+    session = TrainingSession(settings[first])
+    interval = session.interval_steps
+    ends = range(session.trainer.schedule.warmup_steps, session.total_steps, interval)  # none at the end of the run
+    if ends[-1] // rules.every == ends[0] // rules.every:
+        raise UserError(
+            f"pbt_every={rules.every}: nobody would ever copy: of the logging intervals of {interval:,} env steps the "
+            f"last but one ends at {ends[-1]:,}"
+        )
 
 
 def _apart(config: Config) -> tuple[Any, ...]:
