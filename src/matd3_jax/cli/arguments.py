@@ -52,6 +52,9 @@ class Sweep(OfProcesses):
     for files glob(*). With samples=N so many random draws are trained, which may come from intervals:
     algo.lr='interval(1e-4,1e-2)' (log scale where both ends are positive; tag(uniform,interval(...))).
 
+    With pbt=true the settings are the members of a population, and each seed is a population of its own: every now and
+    then its worst members go on from copies of the best, with other values of the swept hyper-parameters.
+
     Leaves a ranked table, table.csv, seeds.csv and sweep.png in its directory; every run is a run directory in runs/,
     for matd3_jax.evaluate, matd3_jax.render and the others.
     """
@@ -66,6 +69,20 @@ class Sweep(OfProcesses):
         "that each process may use at once", default=None, metavar="GB", unit="gigabytes", above=0,
         otherwise="what is free",
     )  # fmt: skip
+    pbt: bool = option("true: the settings are a population, whose worst members copy the best", default=False)
+    pbt_every: int | None = option(
+        "between selections of a population", default=None, unit="env steps", least=1,
+        otherwise="a twentieth of total_steps",
+    )  # fmt: skip
+    pbt_fraction: float | None = option(
+        "of the members that copy, and of those that are copied; at least one", default=None, above=0, most=0.5,
+        otherwise="0.2",
+    )  # fmt: skip
+    pbt_explore: str | None = option(
+        "what is done with the copied hyper-parameters: times 0.8 or 1.2 (in lists a neighbor), or drawn anew",
+        default=None, choices=("perturb", "resample"), otherwise="perturb",
+    )  # fmt: skip
+    pbt_replay: bool | None = option("true: replays are copied, too", default=None, otherwise="false")
     train: bool = option("false: only plan, and say how to train the batches", default=True)
     launcher: str | None = option(
         "train the batches as jobs of a Hydra launcher, e.g. submitit_slurm", default=None, metavar="NAME"
@@ -293,6 +310,7 @@ SWEEP = Command(
     examples=(
         "python -m matd3_jax.sweep algo.lr=0.01,0.003,0.001 algo.policy_delay=1,2 seeds=4",
         "python -m matd3_jax.sweep algo.lr='interval(1e-4,1e-2)' samples=16 seeds=4 memory=8",
+        "python -m matd3_jax.sweep algo.lr='interval(1e-4,1e-2)' samples=16 pbt=true",
     ),
 )  # fmt: skip
 EVALUATE = Command(

@@ -6,21 +6,33 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from matd3_jax import config
 from matd3_jax.cli import arguments, command, options
 from matd3_jax.cli.arguments import Sweep as SweepOptions
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError, nearest
+from matd3_jax.figures import lineage as lineage_figure
 from matd3_jax.figures import sweep as sweep_figure
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runs.paths import inside
 from matd3_jax.runtime import devices, files, multihost, slurm
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.terminal import say
-from matd3_jax.sweep import batching, launcher, ranking, search_space
+from matd3_jax.stats.intervals import mean_interval
+from matd3_jax.stats.text import plus_minus
+from matd3_jax.sweep import batching, launcher, population, ranking, search_space
+from matd3_jax.sweep import lineage as lineages
+from matd3_jax.sweep.lineage import Lineage
+from matd3_jax.sweep.population import Rules
+from matd3_jax.sweep.ranking import Ranked
 from matd3_jax.sweep.runner import Sweep
 from matd3_jax.sweep.search_space import SearchSpace
 from matd3_jax.training.session import TrainingSession
+
+SELECTIONS = 20
+"""Of a population in a run, by default."""
 
 METRIC = "return_agents"
 """By which settings are ranked."""
@@ -53,6 +65,7 @@ def start(given: SweepOptions, argv: Sequence[str], processes: Processes) -> int
     chosen, settings = read(given.settings, given.samples, given.sample_seed)
     metric = given.metric or METRIC
     check_metric(settings.values(), metric)
+    rules = population_rules(given, metric, dict(zip(settings, chosen, strict=True)), settings)
     folder = inside(given.out, given.name or f"sweep-{time.strftime('%Y%m%d-%H%M%S')}", "name")
     if processes.first:
         facts = {
@@ -60,6 +73,8 @@ def start(given: SweepOptions, argv: Sequence[str], processes: Processes) -> int
             "metric": metric,
             "settings": dict(zip(settings, chosen, strict=True)),
         }
+        if rules is not None:
+            facts["pbt"] = rules.facts
         _plan(folder, facts, settings, given.memory, processes)
     folder = processes.same_directory(folder)
     sweep, facts = open_sweep(folder, processes)
@@ -78,7 +93,7 @@ def _plan(
     folder: Path, facts: Mapping[str, Any], settings: Mapping[str, Config], memory: float | None, processes: Processes
 ) -> None:
     """Make the sweep's directory, and say what is in it."""
-    sweep = Sweep(folder, processes)
+    sweep = Sweep(folder, processes, Rules.of(facts))
     empty = folder.is_dir() and not any(folder.iterdir())  # a process was killed just as it had made it
     if not empty and not sweep.unfinished_plan():
         RunDirectory.check_new(folder)
@@ -91,6 +106,33 @@ def _plan(
         files.write_json(folder / "sweep.json", facts)
     seeds = sum(c.seeds for c in settings.values())
     say(f"sweep directory: {folder}\n{len(settings)} settings, {seeds} seeds, {len(sweep.batches)} batches")
+
+
+def population_rules(
+    given: SweepOptions, metric: str, chosen: Mapping[str, Mapping[str, str]], settings: Mapping[str, Config]
+) -> Rules | None:
+    """How a sweep's population is selected and explored; None where it is none. chosen: swept values by setting.
+
+    Raises UserError for options of populations without one, and for settings that cannot be one.
+    """
+    if not given.pbt:
+        for name in ("pbt_every", "pbt_fraction", "pbt_explore", "pbt_replay"):
+            if getattr(given, name) is not None:
+                raise UserError(f"{name}= goes with pbt=true")
+        return None
+    total = next(iter(settings.values())).total_steps
+    rules = Rules(
+        every=given.pbt_every or max(1, total // SELECTIONS),
+        fraction=given.pbt_fraction or 0.2,
+        explore=given.pbt_explore or "perturb",
+        replay=bool(given.pbt_replay),
+        seed=given.sample_seed,
+        overrides=given.settings,
+        metric=metric,
+        settings=chosen,
+    )
+    population.check(rules, settings)
+    return rules
 
 
 def check_metric(settings: Iterable[Config], metric: str) -> None:
@@ -136,8 +178,11 @@ def resume(folder: Path, given: SweepOptions, argv: Sequence[str], processes: Pr
 def open_sweep(folder: Path, processes: Processes = SINGLE_PROCESS) -> tuple[Sweep, dict[str, Any]]:
     """A sweep and its facts (command, metric, settings). Raises UserError if there is none."""
     try:
-        return Sweep(folder, processes), json.loads((folder / "sweep.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        facts = json.loads((folder / "sweep.json").read_text(encoding="utf-8"))
+        return Sweep(folder, processes, Rules.of(facts)), facts
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        if isinstance(error, UserError):
+            raise
         if Sweep(folder).unfinished_plan():
             raise UserError(
                 f"{folder}: its planning was cut short; start the sweep again, with the same name="
@@ -168,10 +213,41 @@ def _resume_line(folder: Path) -> str:
 
 def report(sweep: Sweep, facts: Mapping[str, Any]) -> bool:
     """Table, CSVs and figure of a finished sweep; whether all its seeds diverged."""
-    rows = ranking.rank(sweep.runs, facts["runs"], facts["settings"], str(facts["metric"]))
+    lineage = _lineage(sweep)
+    copied = lineage.copied() if lineage else {}
+    rows = ranking.rank(sweep.runs, facts["runs"], facts["settings"], str(facts["metric"]), copied)
     ranking.show(rows, f"{sweep.folder}: {facts['metric']}")
     ranking.write(sweep.folder, rows)
     sweep_figure.draw(sweep.folder / "sweep.png", sweep.runs, facts["runs"], rows, str(facts["metric"]))
     say(f"all settings: {sweep.folder / 'table.csv'}, all seeds: {sweep.folder / 'seeds.csv'}\n"
           f"figure: {sweep.folder / 'sweep.png'}\nruns: {sweep.runs}")  # fmt: skip
+    if lineage:
+        assert sweep.population is not None
+        _report_population(sweep.folder, lineage, rows, sweep.population.metric)
     return all(row.diverged.all() for row in rows)
+
+
+def _lineage(sweep: Sweep) -> Lineage | None:
+    """Of a sweep's populations; None where it has none, or their file is lost."""
+    if sweep.population is None:
+        return None
+    try:
+        return Lineage.read(sweep.folder / lineages.FILE)
+    except UserError as error:
+        say(f"note: {error}")
+        return None
+
+
+def _report_population(folder: Path, lineage: Lineage, rows: Sequence[Ranked], metric: str) -> None:
+    """Figure of the lineage, the best member of each population, and the schedule that the best of all had."""
+    lineage_figure.draw(folder / "pbt.png", lineage, metric)
+    say(f"lineage: {folder / lineages.FILE}, {folder / 'pbt.png'}")
+    best = ranking.best_members(rows)
+    if not best:
+        return
+    mean, half = mean_interval(np.array([value for value, _ in best.values()]))
+    say(f"best member of each population ({len(best)}), final: {plus_minus(mean, half)}")
+    seed, (value, name) = max(best.items(), key=lambda one: one[1][0])
+    say(f"hyper-parameters of the best, {name} seed {seed} ({value:.4g}), or of those that it copied:")
+    stages = lineage.schedule(lineage.settings.index(name), lineage.seeds.index(seed))
+    say("\n".join(f"  {line}" for line in lineages.lines(stages, lineage.keys)))

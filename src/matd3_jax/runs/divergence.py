@@ -47,11 +47,12 @@ def not_finite(metrics: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return found
 
 
-def of_table(metrics: Mapping[str, np.ndarray]) -> dict[int, Divergence]:
+def of_table(metrics: Mapping[str, np.ndarray], after: Mapping[int, int] | None = None) -> dict[int, Divergence]:
     """The seeds that diverged, by their numbers, ascending.
 
     Args:
         metrics: columns [rows] of the metrics table, each seed's rows ascending.
+        after: env steps by seed, up to which its rows do not count: it has had other networks since.
     """
     wrong = not_finite(metrics)
     found: dict[int, Divergence] = {}
@@ -59,7 +60,9 @@ def of_table(metrics: Mapping[str, np.ndarray]) -> dict[int, Divergence]:
         return found
     for row in np.flatnonzero(np.any(list(wrong.values()), axis=0)).tolist():
         name = next(name for name, there in wrong.items() if there[row])
-        found.setdefault(int(metrics["seed"][row]), Divergence(int(metrics["step"][row]), is_not(metrics, name, row)))
+        seed, step = int(metrics["seed"][row]), int(metrics["step"][row])
+        if after is None or step > after.get(seed, -1):
+            found.setdefault(seed, Divergence(step, is_not(metrics, name, row)))
     return dict(sorted(found.items()))
 
 
@@ -82,14 +85,15 @@ def earliest(*found: Mapping[int, Divergence]) -> dict[int, Divergence]:
     return dict(sorted(merged.items()))
 
 
-def of_run(run: RunDirectory, step: int) -> dict[int, Divergence]:
-    """The seeds of a run that had diverged by env step `step`, as far as its metrics say."""
+def of_run(run: RunDirectory, step: int, after: Mapping[int, int] | None = None) -> dict[int, Divergence]:
+    """The seeds of a run that had diverged by env step `step`, as far as its metrics say; `after`: as in
+    `of_table`."""
     try:
         metrics = run.read_metrics()
     except UserError:
         return {}
     there = metrics["step"] <= step
-    return of_table({name: column[there] for name, column in metrics.items()})
+    return of_table({name: column[there] for name, column in metrics.items()}, after)
 
 
 def without(metrics: Mapping[str, np.ndarray], diverged: Sequence[int] | Mapping[int, object]) -> dict[str, np.ndarray]:

@@ -14,6 +14,8 @@ from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
 from matd3_jax.runtime.terminal import say
+from matd3_jax.sweep.lineage import FILE as LINEAGE
+from matd3_jax.sweep.population import Population, Rules
 from matd3_jax.tracking.messages import FINISHED, STOPPED
 from matd3_jax.training import best as best_evaluations
 from matd3_jax.training import checkpoint, film, finish, host_states, hybrid, starting
@@ -49,6 +51,8 @@ class Batch:
         group: the name of the sweep, by which loggers group its runs.
         processes: which train it together.
         keep_last: leave a checkpoint of all of it at its end.
+        population: its runs are the members of populations.
+        lineage: the file of these.
     """
 
     def __init__(
@@ -60,6 +64,8 @@ class Batch:
         group: str,
         processes: Processes = SINGLE_PROCESS,
         keep_last: bool = False,
+        population: Rules | None = None,
+        lineage: Path = Path(LINEAGE),
     ):
         self.keep_last = keep_last
         self.title, self.runs, self.members = title, list(runs), list(members)
@@ -73,6 +79,9 @@ class Batch:
             say,
             names=[f"{c.name}: seed {seed}" for c in self.members for seed in c.seed_numbers],
         )
+        self.population = None
+        if population is not None:
+            self.population = Population(population, self.training, self.watch.diverged, lineage)
 
     def train(self, stop: Stop) -> None:
         """From the last checkpoint, or from the start, to the end or until a signal comes."""
@@ -109,9 +118,12 @@ class Batch:
                 run.sync()
             to = self.checkpoints, step, training.trainer, state
             tables = [run.metrics for run in self.runs]
-            checkpoint.save(*to, keep=1, share=training.share, best=training.best, tables=tables)
+            more = None if self.population is None else self.population.write
+            checkpoint.save(*to, keep=1, share=training.share, best=training.best, tables=tables, more=more)
 
-        outcome = training_run.run(training, start.state, row, loggers, save, stop, start.save_first, filmer)
+        begin = training, start.state, row
+        change = self.population
+        outcome = training_run.run(*begin, loggers, save, stop, start.save_first, filmer, change=change)
         if outcome.stopped is not None:
             save(outcome.state, int(outcome.row["step"][0]))
             out.how = STOPPED
@@ -140,12 +152,16 @@ class Batch:
             if first:
                 self.table.log(row)
                 self.watch.log(row)
+            if self.population is not None:
+                self.population.begin(row)
             return Start(state, row, row_is_new=True, save_first=True)
         saved = Path(broadcast(str(checkpoint.verify(self.checkpoints)) if first else None))
         for line in host_states.notes(saved, self.training.trainer, unpickle=False, sweep=True) if first else ():
             say(line)
         training, done = self.training, int(saved.name)
         state = checkpoint.restore(saved, training.trainer, training.share, best=training.best)
+        if self.population is not None:
+            self.population.restore(saved)
         self.processes.barrier()
         for number, (run, config) in enumerate(zip(self.runs, self.members, strict=True)) if first else ():
             for line in run.cut(done, self.training.expected_table(config), saved, number):
@@ -166,7 +182,9 @@ class Batch:
         self.processes.barrier()
         runs = [RunDirectory(run.path / hybrid.FOLDER) for run in self.runs]
         folder = self.checkpoints.with_name(hybrid.FOLDER)
-        part = Batch(f"{self.title}, {hybrid.FOLDER}", runs, settings, folder, self.group, self.processes, True)
+        part = Batch(
+            f"{self.title}, {hybrid.FOLDER}", runs, settings, folder, self.group, self.processes, keep_last=True
+        )
         finished = all(run.summary() is not None for run in runs) if first else None
         if not self.processes.broadcast(finished):
             part.train(stop)
@@ -186,7 +204,8 @@ class Batch:
     def _note_diverged(self, done: int) -> None:
         """Note which seeds had diverged by env step `done`."""
         for run, config, own in zip(self.runs, self.members, self.seeds, strict=True):
-            known = divergence.of_run(run, done)
+            copied = None if self.population is None else self.population.lineage.copied().get(str(config.name))
+            known = divergence.of_run(run, done, copied)
             self.watch.diverged |= {own.start + seed - config.seed: found for seed, found in known.items()}
 
     def _finish(self, state: TrainState, row: Row, facts: Mapping[str, Any], out: Outputs) -> None:
@@ -205,6 +224,7 @@ class Batch:
             }
             settings = str(config.name), config.diagnostics.q_bias
             own_facts = {**facts, **best_evaluations.summary(saved, config.seed_numbers)}
+            own_facts |= {} if self.population is None else self.population.facts(number)
             found = finish.finish(run, self.training.layout, *settings, done, own_facts, diverged)
             out.finish(number, found)
 

@@ -39,24 +39,35 @@ class Ranked:
         return float(mean), float(half)
 
 
-def rank(folder: Path, runs: Mapping[str, Sequence[str]], settings: Mapping[str, Mapping], metric: str) -> list[Ranked]:
+def rank(
+    folder: Path,
+    runs: Mapping[str, Sequence[str]],
+    settings: Mapping[str, Mapping],
+    metric: str,
+    copied: Mapping[str, Mapping[int, int]] | None = None,
+) -> list[Ranked]:
     """The settings of finished runs, best final mean first; settings with diverged seeds after those without.
 
     Args:
         folder: where the run directories are; runs: their names by setting.
         settings: swept values by setting.
+        copied: by setting and seed the env step at which a member of a population last copied another: up to there it
+            may have diverged.
 
     Raises UserError where the metrics tables have no column `metric`.
     """
     rows = []
     for name, values in settings.items():
         seeds, final, area, diverged = [], [], [], []
+        after = (copied or {}).get(name, {})
         for run in runs[name]:
             table = RunDirectory(folder / run).read_metrics()
             if metric not in table:
                 raise UserError(f"metric={metric}: the metrics table has no such column; {nearest(metric, table)}")
             summary = RunDirectory(folder / run).summary() or {}
-            lost = {*divergence.of_table(table), *map(int, summary.get("diverged", ()))}
+            known = {int(seed): step for seed, step in (summary.get("diverged") or {}).items()}
+            lost = {seed for seed, step in known.items() if step > after.get(seed, -1)}
+            lost |= set(divergence.of_table(table, after))
             for seed in np.unique(table["seed"]):
                 there = table["seed"] == seed
                 steps, curve = table["step"][there], table[metric][there]
@@ -72,6 +83,17 @@ def rank(folder: Path, runs: Mapping[str, Sequence[str]], settings: Mapping[str,
         return float(row.diverged.mean()), -mean if np.isfinite(mean) else np.inf
 
     return sorted(rows, key=order)
+
+
+def best_members(rows: Sequence[Ranked]) -> dict[int, tuple[float, str]]:
+    """For each seed, which is a population, the best final value and the setting that has it, without those that
+    diverged."""
+    found: dict[int, tuple[float, str]] = {}
+    for row in rows:
+        for seed, value in zip(row.seeds[~row.diverged].tolist(), row.final[~row.diverged].tolist(), strict=True):
+            if np.isfinite(value) and value > found.get(seed, (-np.inf, ""))[0]:
+                found[seed] = (value, row.name)
+    return found
 
 
 def show(rows: Sequence[Ranked], title: str, most: int = 30) -> None:

@@ -5,6 +5,7 @@ and, while a batch is trained, `batches/K/` with its checkpoints. Each batch can
 """
 
 import contextlib
+import dataclasses
 import json
 import shutil
 from collections.abc import Collection, Iterator, Mapping
@@ -21,6 +22,8 @@ from matd3_jax.runtime.signals import Stop
 from matd3_jax.runtime.terminal import say
 from matd3_jax.sweep import batching
 from matd3_jax.sweep.batch import Batch
+from matd3_jax.sweep.lineage import FILE as LINEAGE
+from matd3_jax.sweep.population import Rules
 from matd3_jax.training import hybrid, outputs, starting
 from matd3_jax.training.memory import most_seeds
 from matd3_jax.training.session import TrainingSession
@@ -32,10 +35,18 @@ class Sweep:
     Args:
         processes: which train every batch together, its seeds shared out among them (among as many as there are
             seeds); the first of them plans, and writes all but the others' part of checkpoints.
+        population: the runs are the members of populations, in one batch.
+
+    Raises UserError for populations in several processes.
     """
 
-    def __init__(self, folder: Path, processes: Processes = SINGLE_PROCESS):
-        self.folder, self.processes = folder, processes
+    def __init__(self, folder: Path, processes: Processes = SINGLE_PROCESS, population: Rules | None = None):
+        if population is not None and processes.size > 1:
+            raise UserError(
+                f"pbt=true: members copy each other within one process, and these are {processes.size}: start one "
+                "(it uses all devices of its machine)"
+            )
+        self.folder, self.processes, self.population = folder, processes, population
         self.runs = folder / "runs"
         self._name = next((name for name in reversed(PLANS) if (folder / f"{name}.json").exists()), PLANS[0])
         self._plan = folder / f"{self._name}.json"
@@ -94,7 +105,8 @@ class Sweep:
         Args:
             budget: bytes that a batch may take in each process; None: what is free now.
 
-        Raises UserError where a setting is impossible, or one seed of it does not fit.
+        Raises UserError where a setting is impossible, or one seed of it does not fit, or the members of populations
+        do not fit at once.
         """
         planned = {name for batch in self.batches for name in batch}
         for path in _entries(self.runs):
@@ -102,6 +114,8 @@ class Sweep:
                 shutil.rmtree(path)
         for config in settings.values():
             outputs.check(config)
+        if self.population is not None and any(config.hands_over for config in settings.values()):
+            raise UserError("pbt=true: members of a population are trained by one program, hybrid runs by two")
         for config in {batching.program(config): config for config in settings.values() if config.hands_over}.values():
             hybrid.switch_step(TrainingSession(config))
         if any(config.on_divergence == "stop" for config in settings.values()):
@@ -112,7 +126,15 @@ class Sweep:
         budget = devices.free_memory(self.processes.local) if budget is None else budget
         size = self.processes.size
         existing = batching.existing_runs(self.runs)
+        if self.population is not None:
+            budget -= replay_bytes(next(iter(settings.values())))  # of the seed that is being copied
         new = batching.batches(settings, existing, self.runs, lambda config: size * fitting_seeds(config, budget))
+        if self.population is not None and len(new) > 1:
+            seeds = sum(config.seeds for config in settings.values())
+            raise UserError(
+                f"pbt=true: all members are trained at once, and their {seeds} seeds do not fit into "
+                f"{budget / 1e9:.2f} GB: fewer members or seeds, or a smaller replay_capacity"
+            )
         machine = {"versions": devices.versions(), **devices.description()}
         runs = [config for batch in new for config in batch]
         given = [
@@ -166,7 +188,9 @@ class Sweep:
         title = f"batch {batch} ({batch + 1} of {len(self.batches)})"
         runs = [RunDirectory(self.runs / name) for name in names]
         group = self.folder.absolute().name
-        return Batch(title, runs, self.members(batch), self.folder_of(batch) / "checkpoints", group, processes)
+        place, lineage = self.folder_of(batch) / "checkpoints", self.folder / LINEAGE
+        how = group, processes, False, self.population, lineage
+        return Batch(title, runs, self.members(batch), place, *how)
 
     @contextlib.contextmanager
     def _taken(self, batch: int) -> Iterator[bool]:
@@ -232,6 +256,12 @@ def train(settings: Mapping[str, Config], folder: Path, budget: int | None = Non
         if RunDirectory(path).summary() is None:
             raise UserError(f"{path} is not finished: another process trains it, or the sweep's plan does not have it")
     return runs
+
+
+def replay_bytes(config: Config) -> int:
+    """Of one seed of a run's settings."""
+    trainer = TrainingSession(dataclasses.replace(config, seeds=1)).trainer
+    return trainer.replay_bytes // trainer.sharding.devices_per_seed
 
 
 def fitting_seeds(config: Config, budget: int) -> int:

@@ -17,6 +17,9 @@ from matd3_jax.errors import UserError
 DIGITS = 4
 """Significant digits of a number drawn from an interval: what is written down is what was run."""
 
+DOWN, UP = 0.8, 1.2
+"""Factors of a number that is perturbed."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Axis:
@@ -43,6 +46,28 @@ class Axis:
         if self.log:
             return f"{math.exp(rng.uniform(math.log(self.low), math.log(self.high))):.{DIGITS}g}"
         return f"{rng.uniform(self.low, self.high):.{DIGITS}g}"
+
+    def perturb(self, value: str, rng: np.random.Generator) -> str:
+        """A value near `value`, up or down at random: 0.8 or 1.2 times it, or a neighbor of it in the list; never
+        beyond the interval, or the list's ends (Jaderberg et al. 2017, section 4.1)."""
+        up = bool(rng.integers(2))
+        if self.values:
+            ordered = self._ordered()
+            place = ordered.index(value) + (1 if up else -1)
+            return ordered[min(max(place, 0), len(ordered) - 1)]
+        moved = float(value) * (UP if up else DOWN)
+        if self.whole:
+            near = round(moved) if round(moved) != int(value) else int(value) + (1 if up else -1)
+            return str(min(max(near, int(self.low)), int(self.high)))
+        # An end is written in full: four digits of it may lie outside.
+        return repr(self.low) if moved <= self.low else repr(self.high) if moved >= self.high else f"{moved:.{DIGITS}g}"
+
+    def _ordered(self) -> list[str]:
+        """The listed values, numbers by size and others as they are listed."""
+        try:
+            return sorted(self.values, key=float)
+        except ValueError:
+            return list(self.values)
 
 
 @dataclasses.dataclass(frozen=True)

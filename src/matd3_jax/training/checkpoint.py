@@ -3,7 +3,7 @@
 Layout of one: `STEP/state` (all but the replay; several processes write `STEP/state/FIRST`, each its seeds, from number
 FIRST on), `STEP/replay/SEED` (the rows filled so far; none in what a sweep leaves of its runs), `STEP/best/SEED.npz`
 (see `training.best`), `STEP/host/SEED` (of environments on the host that are pickled), `STEP/metrics.json` (see
-`runs.table_digest`), `STEP/checksums.json`.
+`runs.table_digest`), `STEP/population.json` (of a sweep's population), `STEP/checksums.json`.
 A checkpoint appears under its name only when it is whole. The replay is written and read one seed at a time, so that it
 never stands in memory twice. What some processes wrote any other number of them can read.
 """
@@ -55,6 +55,7 @@ def save(
     share: Share | None = None,
     best: BestPolicies | None = None,
     tables: Sequence[Path] = (),
+    more: Callable[[Path], Path] | None = None,
 ) -> Path:
     """Write the checkpoint of env step `step` and delete all but the newest `keep`.
 
@@ -64,6 +65,7 @@ def save(
             there are no others.
         best: the policies of the trainer's seeds to be kept with it.
         tables: metrics tables of its runs, so that it is noticed when they are changed.
+        more: writes a further file into its folder, and returns it.
     """
     share = share or SINGLE_PROCESS.share(trainer.num_seeds)
     processes, wanted = share.processes, seeds or slice(0, share.total)
@@ -96,6 +98,8 @@ def save(
         written += host_states.save(partial_, trainer, state, share)
     if tables and processes.first:
         written.append(table_digest.write(partial_, tables))
+    if more is not None and processes.first:
+        written.append(more(partial_))
     parts = processes.gather_messages(json.dumps(_checksums(partial_, written)).encode())
     if processes.first:
         checksums = dict(sorted(pair for part in parts for pair in json.loads(part).items()))

@@ -75,9 +75,13 @@ class TrainLoop:
         sharding = SeedSharding(num_seeds, schedule.batch_size, devices, devices_per_seed, seeds_together)
         self.sharding, self.mesh, self.on_cpu = sharding, sharding.mesh, sharding.on_cpu
         self.learner = Learner(layout, schedule, sharding, least_deviation, unroll)
-        per_group = [hyper[layout.teams[group.members[0]]] for group in layout.groups]
-        spread = jax.tree.map(lambda h: jnp.broadcast_to(jnp.asarray(h, jnp.float32), num_seeds), per_group)
-        self.hyper = tuple(jax.tree.map(sharding.pad, spread))
+        self.hyper = self.per_group(hyper)
+
+    def per_group(self, hyper: dict[str, HyperParams]) -> tuple[HyperParams, ...]:
+        """Spread the hyper-parameters of teams, numbers or arrays [num_seeds], over groups: leaves [padded_seeds]."""
+        each = [hyper[self.layout.teams[group.members[0]]] for group in self.layout.groups]
+        spread = jax.tree.map(lambda h: jnp.broadcast_to(jnp.asarray(h, jnp.float32), self.num_seeds), each)
+        return tuple(jax.tree.map(self.sharding.pad, spread))
 
     @cached_property
     def seeds_apart(self) -> bool:

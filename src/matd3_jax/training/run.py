@@ -44,6 +44,7 @@ def run(
     stop: Stop | None = None,
     save_first: bool = False,
     film: Callable[[TrainState, int, int], object] | None = None,
+    change: Callable[[TrainState, Row, int], TrainState] | None = None,
 ) -> Outcome:
     """Train interval after interval to the end, or until a signal comes, or with `on_divergence=stop` until a seed
     diverges, with `stop_seed` until all have; the loggers are closed then.
@@ -58,6 +59,7 @@ def run(
         stop: signals that have come; None: none are heeded.
         save_first: write a checkpoint before anything is trained.
         film: sees the state after each interval, with the env steps before and after it.
+        change: gives the state to train on from after each interval, from its state and row and the env step before it.
     """
     step = saved = int(row["step"][0])
     every, minutes = training.checkpoint_every, training.config.checkpoint_minutes
@@ -98,6 +100,8 @@ def run(
                 logger.log(row)
             if film is not None:
                 film(state, before, step)
+            if change is not None:
+                state = change(state, row, before)
             if due():
                 write(state)
             signal, halt = stopped(), agreed("stop", lambda watch: watch.new > 0)

@@ -101,6 +101,7 @@ class TrainingSession:
             sequential=config.update_order == "sequential",
             random_order=config.update_order == "random_sequential",
         )
+        self._each = [member for member in self.members for _ in range(member.seeds)]
         hyper = {team: self._hyper(team) for team in teams}
         seeds, normalize = len(self.seeds), config.normalize_observations
         local = jax.local_devices()
@@ -134,8 +135,18 @@ class TrainingSession:
 
     def _hyper(self, team: str) -> HyperParams:
         """The team's hyper-parameters, leaves [seeds]."""
-        each = [m.teams()[team].hyper_params() for m in self.members for _ in range(m.seeds)][self.share.seeds]
+        each = [config.teams()[team].hyper_params() for config in self._each[self.share.seeds]]
         return jax.tree.map(lambda *leaves: np.array(leaves, np.float32), *each)
+
+    def change_hyper(self, each: Sequence[Config]) -> None:
+        """Go on with other hyper-parameters, in the same compiled programs.
+
+        Args:
+            each: settings [seeds of all processes], which differ from those before in `HyperParams` only.
+        """
+        self._each = list(each)
+        self.trainer.hyper = self.trainer.per_group({team: self._hyper(team) for team in self.config.teams()})
+        self.interval = self.interval._replace(hyper=self.trainer.hyper)
 
     # ---- memory ------------------------------------------------------------------------------------------------------
 
