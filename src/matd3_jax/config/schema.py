@@ -65,7 +65,8 @@ class AlgoConfig:
 
     name: str = setting(SHAPES)
     joint: bool = setting(SHAPES)
-    critic: str = setting(SHAPES, choices=("central", "own"))
+    critic: str = setting(SHAPES, choices=("central", "own", "shared"))
+    share_parameters: str = setting(SHAPES, choices=("none", "kind"), before="none")
     num_critics: int = setting(SHAPES, least=1)
     target_critics: int | None = setting(SHAPES, least=1, before=None)
     actor_critics: str = setting(SHAPES, choices=("first", "all"), before="first")
