@@ -1,8 +1,8 @@
 """Agents of a kind with one actor and one set of critics together (`share_parameters=kind`), for one seed.
 
 Gupta et al. 2017 (parameter sharing), with the index of the agent among those that share given to every network beside
-what it reads (agent indication: Gupta et al. 2017, Terry et al. 2020). The loss is the mean over the agents of their
-own losses (`losses`), as if one minibatch had the transitions of all of them; everybody learns at the same time.
+what it reads (agent indication, Terry et al. 2020). The loss is the mean over the agents of their own losses
+(`losses`), as if one minibatch had the transitions of all of them; everybody learns at the same time.
 """
 
 from collections.abc import Callable
