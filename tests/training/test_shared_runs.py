@@ -16,9 +16,11 @@ from matd3_jax.cli import command, sweep, train
 from matd3_jax.core import q_bias
 from matd3_jax.errors import UserError
 from matd3_jax.evaluation import cross_play
+from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.sweep import batching
 from matd3_jax.sweep.runner import Sweep
-from matd3_jax.training import checkpoint, memory, starting
+from matd3_jax.training import best, checkpoint, memory, saved_policies, starting
+from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.recording import Recorder
 from matd3_jax.training.session import TrainingSession
 
@@ -271,3 +273,49 @@ def test_it_goes_with_other_settings(more):
     state, row = training.advance(state)
     assert all((a != np.asarray(group.actor["kernel_0"])).any() for a, group in zip(before, state.groups, strict=True))
     assert training.finite(state).all() and set(row) == set(training.columns)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("more", [[KIND], [TEAM, KIND]], ids=" ".join)
+def test_two_devices_learn_from_a_minibatch_what_one_does(more):
+    """One seed: each device has half of the minibatch, and gradients are averaged."""
+    training = TrainingSession(config.load([*SHORT, *more, "seeds=1"]))
+    assert training.trainer.sharding.minibatch_axis is not None
+    alone = TrainLoop(training.env, training.layout, training.trainer.schedule,
+                      {team: algo.hyper_params() for team, algo in training.config.teams().items()}, 1,
+                      jax.local_devices()[:1])  # fmt: skip
+    found = []
+    for trainer in (training.trainer, alone):
+        state, _ = trainer.warm_up(trainer.init(training.keys()))
+        state, metrics = trainer.interval(1)(state)
+        found.append(jax.tree.map(np.asarray, ([g.actor for g in state.groups], metrics.update)))
+    # Adam's first step goes by the sign of a gradient: what is 0 but for rounding may go either way.
+    far = [np.abs(a - b) > 1e-3 for a, b in zip(*map(jax.tree.leaves, found), strict=True)]
+    assert np.mean(np.concatenate([part.ravel() for part in far])) < 0.01
+
+
+@pytest.mark.slow
+def test_a_team_of_several_kinds_with_one_set_of_critics(tmp_path):
+    """The second kind's group has no critics, but a best policy and a place in what other runs begin with."""
+    lines = ["env=simple_speaker_listener", *TINY[1:], TEAM]
+    assert train.main([*lines, f"out={tmp_path}", "name=run", "checkpoint_every=300", "keep_checkpoints=3"]) == 0
+    path = tmp_path / "run"
+    kept = best.read(checkpoint.verify(path / "checkpoints"), 0).policies
+    assert {name.split(".actor")[0] for name in kept} == {".groups[0]", ".groups[1]"}
+    training = TrainingSession(config.load([*lines, f"init={path}", "init_checkpoint=best"]))
+    given, (_, there) = starting.gather(training), restored(path)
+    assert [group.critic is None for group in there.groups] == [False, True]
+    np.testing.assert_array_equal(
+        given[".groups[0].critic['kernel_0']"], np.asarray(there.groups[0].critic["kernel_0"])
+    )
+    for g in range(2):
+        np.testing.assert_array_equal(given[f".groups[{g}].actor['bias_1']"][0], kept[f".groups[{g}].actor['bias_1']"])
+    assert not any(name.startswith(".groups[1].critic") for name in given)
+    saved = saved_policies.load(RunDirectory.open(path)[0], restored(path)[0], "best")
+    assert all(np.isfinite(leaf).all() for group in saved.state.groups for leaf in group.actor.values())
+    cut = shutil.copytree(path, tmp_path / "cut")
+    first, *later = checkpoint.steps(cut / "checkpoints")
+    for step in later:
+        shutil.rmtree(cut / "checkpoints" / str(step))
+    assert train.main([f"resume={cut}", f"checkpoint={first}"]) == 0
+    assert (cut / "metrics.csv").read_bytes() == (path / "metrics.csv").read_bytes()
