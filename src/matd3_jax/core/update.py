@@ -105,11 +105,12 @@ def update(
 
     Args:
         state, hyper: one element per group.
-        rows: replay rows [num_agents, batch, row_size], a minibatch for each agent, or [1, batch, row_size] for all;
-            with n_step > 1 as `n_step.draw` gives them.
+        rows: replay rows [minibatches, batch, row_size], a minibatch for each agent or for those of a team with one set
+            of critics (`JointLayout.minibatches`), or [1, batch, row_size] for all; with n_step > 1 as `n_step.draw`
+            gives them.
         move: for each group whether this update moves actors and targets too (every policy_delay-th does).
         sequential: later agents see the earlier ones' moved target actors (the authors' program) instead of all
-            learning from the same state.
+            learning from the same state; not where agents share a network.
         one_by_one: compute the agents of a group one after another instead of in one batch: the same numbers, while
             one agent's activations stay in a CPU's cache.
         axis: mesh axis whose devices share the work of each minibatch: `rows` are this device's equal part of it (the
