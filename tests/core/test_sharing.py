@@ -11,7 +11,7 @@ import pytest
 import sharing_reference
 from learner_cases import BATCH, DISTRIBUTION, QUANTILES, Case, adam, drawn, layers, random_rows, random_state
 
-from matd3_jax.core import agents, losses, sequential_actors, sharing, update
+from matd3_jax.core import agents, losses, networks, sequential_actors, sharing, update
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.envs import Box, Simplex
@@ -139,6 +139,16 @@ def test_update_equals_reference(name):
         assert a.shape == b.shape
         np.testing.assert_allclose(a, b, rtol=TOLERANCE, atol=TOLERANCE)
     np.testing.assert_allclose(np.stack(metrics), losses_wanted, rtol=TOLERANCE, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("name", ["kind", "both"])
+def test_large_minibatches_are_computed_alike(name, monkeypatch):
+    """In a loop over the agents that adds their gradients up: the same numbers."""
+    *_, wanted, _ = base(name)
+    monkeypatch.setattr(networks, "SMALL_BATCH", 0)
+    *_, found, _ = base.__wrapped__(name)
+    for a, b in zip(*map(jax.tree.leaves, (found, wanted)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=TOLERANCE, atol=TOLERANCE)
 
 
 @pytest.mark.parametrize("part", [0, 1], ids=["actor", "critics"])
