@@ -113,20 +113,24 @@ def _update(trainer: TrainLoop, group: Group) -> Iterator[tuple[Product, float]]
     layout, algorithm = trainer.layout, group.algorithm
     batch = trainer.schedule.batch_size // trainer.sharding.devices_per_seed
     hidden, delay = algorithm.hidden, algorithm.policy_delay
-    central = algorithm.critic == "central"
+    central, g = algorithm.central, layout.groups.index(group)
     # With one minibatch for all, the members of a group share their target actions.
     shared = len(group.members) if trainer.schedule.shared_minibatch and central else 1
+    # A team's one set of critics, of which each member of its first group has a part here.
+    judging = (float(layout.critic_group(g) == g) / len(group.members)) if group.team_critic else 1.0
+    if group.team_critic:
+        shared = 1
     for other in layout.groups if central else (group,):
         sizes = (other.observation_size, *other.algorithm.hidden, other.action_space.size)
         members = (len(other.members),) if central else ()
-        yield from ((part, 1 / shared) for part in _forward(members, batch, sizes))
+        yield from ((part, judging / shared) for part in _forward(members, batch, sizes))
     critic = (update.critic_input_size(layout, group), *hidden, group.critic.num_outputs)
     twins = algorithm.num_critics
     targets, climbed = algorithm.critics_in_target, algorithm.critics_climbed
     every, target, first = (_first_to_last(number, batch, critic) for number in (twins, targets, climbed))
-    yield from ((part, 1) for part in target + every)
-    yield Product("bi,bo->io", (batch, critic[0]), (batch, twins * critic[1])), 1
-    yield from ((part, 1) for part in _backward((twins,), batch, critic)[1:])
+    yield from ((part, judging) for part in target + every)
+    yield Product("bi,bo->io", (batch, critic[0]), (batch, twins * critic[1])), judging
+    yield from ((part, judging) for part in _backward((twins,), batch, critic)[1:])
     if algorithm.adversarial:
         # The slopes by which others' actions are moved: of the target's critics, and of those that the actor climbs.
         yield from ((part, 1) for part in [*target, *_back_to_inputs(targets, batch, critic)])
@@ -140,7 +144,10 @@ def _update(trainer: TrainLoop, group: Group) -> Iterator[tuple[Product, float]]
     k = group.action_space.size
     actor = (group.observation_size, *hidden, k)
     width = climbed * critic[1]
-    yield from ((part, 1 / delay) for part in _forward((), batch, actor) + first)
+    # All actors of a team climb one product of what was replayed, unless they look at the others' policies of then.
+    once = judging if not trainer.schedule.random_order else 1.0
+    yield first[0], once / delay
+    yield from ((part, 1 / delay) for part in _forward((), batch, actor) + first[1:])
     yield Product("bi,io->bo", (batch, k), (k, width)), 1 / delay  # the own action's change
     yield Product("bo,io->bi", (batch, width), (k, width)), 1 / delay
     yield from ((part, 1 / delay) for part in _backward((climbed,), batch, critic)[1:] if part.equation.endswith("bi"))
@@ -193,7 +200,7 @@ def least_bytes(trainer: TrainLoop, part: str = "loop") -> int:
     """Bytes of one iteration, all seeds, that cannot stay in a cache: minibatches read from the replay, new rows
     written, networks and optimizers read and written once an update (twice for what is moved along)."""
     schedule, layout = trainer.schedule, trainer.layout
-    batches = 1 if schedule.shared_minibatch else layout.num_agents
+    batches = 1 if schedule.shared_minibatch else layout.num_minibatches
     state = memory.size(trainer.abstract_state().groups) // trainer.sharding.padded_seeds
     written = 4 * layout.row_size * schedule.rollout_steps
     read = schedule.updates_per_collect * (4 * layout.row_size * batches * schedule.batch_size + 2 * state)

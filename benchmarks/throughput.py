@@ -194,7 +194,7 @@ def _gathers(trainer: TrainLoop, state: TrainState, hyper: Any) -> tuple[TrainSt
     """The minibatches of one iteration, read and summed."""
     schedule = trainer.schedule
     count = trainer.rollouts_per_iteration * schedule.updates_per_collect
-    batches = 1 if schedule.shared_minibatch else trainer.layout.num_agents
+    batches = 1 if schedule.shared_minibatch else trainer.layout.num_minibatches
     size = replay.filled(schedule.replay_capacity, schedule.rollout_steps, state.rollouts)
     keys = jax.vmap(lambda key: jax.random.split(key, count + 1))(state.key)
 

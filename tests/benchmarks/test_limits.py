@@ -33,6 +33,9 @@ SMALL = ("total_steps=100", "replay_capacity=100", "learning_starts=100", "batch
         ("seeds=2", "env=simple_tag", "algo=m3matd3", "adversary=m3ddpg", "adversary.hidden=[5]"),
         ("seeds=2", "algo.critic_norm=layer", "algo.critic_head=categorical", "algo.critic_range=[-50,0]"),
         ("seeds=2", "algo.num_critics=5", "algo.target_critics=2", "algo.actor_critics=all"),
+        ("seeds=2", "env=simple_tag", "algo.share_parameters=kind", "algo.policy_delay=1"),
+        ("seeds=2", "env=simple_speaker_listener", "algo.critic=shared"),
+        ("seeds=2", "algo.critic=shared", "algo.share_parameters=kind", "shared_minibatch=true"),
         (
             "seeds=2",
             "algo=m3matd3",

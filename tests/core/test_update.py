@@ -1,17 +1,18 @@
 """One update against the float64 reference, for every algorithm of the family, and what must not depend on what."""
 
+import contextlib
 import dataclasses
 import functools
 
 import jax
 import jax.numpy as jnp
+import known_noise
 import numpy as np
 import pytest
 import reference
 from learner_cases import BATCH, CASES, agents_of, drawn, numbers, random_rows, random_state
 
 from matd3_jax.core import minibatch, networks, sequential_actors, update
-from matd3_jax.core.policies import CategoricalPolicy, DeterministicPolicy
 
 KEY = jax.random.key(0)
 TOLERANCE = 1e-10
@@ -21,10 +22,8 @@ effect meant to be seen, Adam's epsilon in the other place, is above 1e-7 (`test
 
 
 def noise_table(kind, size, batch=BATCH):
-    """The noise [batch, size] that stands in for every draw of that kind and size: the same for all agents, so that
-    keys and the order of draws do not matter here (`test_draws_have_their_own_keys` looks at those)."""
-    rng = np.random.default_rng([size, kind == "normal"])
-    return rng.gumbel(size=(batch, size)) if kind == "gumbel" else rng.normal(size=(batch, size))
+    """The noise of every draw (`test_draws_have_their_own_keys` looks at keys and their order)."""
+    return known_noise.table(kind, size, batch)
 
 
 class Program:
@@ -44,26 +43,9 @@ class Program:
 
         self.jitted = jax.jit(run)
 
-    def __call__(self, state, rows, known_noise=True):
-        """Who samples or smooths gets the table's noise; whether there is noise at all stays the learner's choice."""
-
-        def with_table(kind):
-            real_sample, real_smooth = kind.sample, kind.smooth
-
-            def sample(policy, output, draw, *scale):
-                draw = None if draw is None else noise_table("gumbel", policy.size)
-                return real_sample(policy, output, draw, *scale)
-
-            def smooth(policy, action, draw, *options):
-                return real_smooth(policy, action, noise_table("normal", policy.size), *options)
-
-            patch.setattr(kind, "sample", sample)
-            patch.setattr(kind, "smooth", smooth)
-
-        with jax.enable_x64(True), pytest.MonkeyPatch.context() as patch:
-            if known_noise:
-                with_table(DeterministicPolicy)
-                with_table(CategoricalPolicy)
+    def __call__(self, state, rows, known_noise_given=True):
+        noise = known_noise.known(BATCH) if known_noise_given else contextlib.nullcontext()
+        with jax.enable_x64(True), noise:
             return jax.tree.map(np.asarray, self.jitted(state, rows))
 
     def inputs(self, seed=0):
@@ -316,7 +298,7 @@ def test_twin_critics_see_the_same_action():
         same = jax.tree.map(lambda leaf: np.repeat(leaf[:, :1], 2, 1) if leaf.ndim > 1 else leaf, critics)
         return s._replace(**same)
 
-    new, _ = p(tuple(map(alike, state)), rows, known_noise=False)
+    new, _ = p(tuple(map(alike, state)), rows, known_noise_given=False)
     for s in new:
         for leaf in jax.tree.leaves((s.critic, s.critic_target)):
             np.testing.assert_array_equal(leaf[:, 0], leaf[:, 1])
@@ -365,7 +347,7 @@ def test_draws_have_their_own_keys(monkeypatch):
         return jnp.stack(keys)
 
     p.jitted = jax.jit(run)
-    drawn = p(*p.inputs(), known_noise=False)
+    drawn = p(*p.inputs(), known_noise_given=False)
     assert len(np.unique(drawn, axis=0)) == len(drawn)
     # Three groups of central critics, two of them of choices: each has 2 samples and 3 smoothings of targets, and the
     # two an own action.

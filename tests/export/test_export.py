@@ -30,6 +30,7 @@ CASES = {
     "sigmoid": ["env=point_reach"],
     "tanh": ["env=point_reach", "algo.actor_output=tanh", "algo.actor_average=0.1", "normalize_observations=true"],
     "soft words and moves": ["env=simple_reference"],
+    "one actor for both": ["env=point_reach", "algo.share_parameters=kind", "normalize_observations=true"],
     "choices": ["env=simple_reference", "env.actions=discrete", "normalize_observations=true",
                 "normalize_least_deviation=0.3"],
     "a choice, and teams": ["env=simple_tag", "env.actions=discrete", "adversary=maddpg", "adversary.hidden=[9,7]"],

@@ -34,6 +34,7 @@ def check(config: "Config") -> None:
     for name, team in {"algo": config.algo, "adversary": config.adversary}.items():
         if team is not None:
             _check_team(name, team, config.updates_per_collect, need)
+            _check_order(name, team, config.update_order, need)
     collect = config.num_envs * config.rollout_length
     need(
         config.batch_size <= config.replay_capacity,
@@ -113,8 +114,8 @@ def _check_team(name: str, team: "AlgoConfig", updates: int, need: Any) -> None:
     for key in ("adversarial_step", "adversarial_step_team"):
         need(
             team.critic == "central" or not getattr(team, key),
-            f"{name}.{key}={getattr(team, key)} needs {name}.critic=central: {team.name}'s critics do not see the "
-            "others' actions",
+            f"{name}.{key}={getattr(team, key)} needs {name}.critic=central: {team.name}'s critics "
+            + ("are the whole team's" if team.critic == "shared" else "do not see the others' actions"),
         )
     need(
         team.critic_head != "categorical" or team.critic_range is not None,
@@ -133,6 +134,11 @@ def _check_team(name: str, team: "AlgoConfig", updates: int, need: Any) -> None:
         team.joint or not team.hands_over,
         f"{name}.hands_over=true needs {name}.joint=true: an agent that takes the place of several",
     )
+    need(
+        not team.hands_over or team.frozen or (team.share_parameters == "none" and team.critic != "shared"),
+        f"{name}.hands_over=true joins networks that are each agent's own: leave {name}.share_parameters and "
+        f"{name}.critic=shared out",
+    )
     for key, plain in (("critic_head", "scalar"), ("critic_norm", "none")):
         need(
             not team.hands_over or team.frozen or getattr(team, key) == plain,
@@ -141,6 +147,20 @@ def _check_team(name: str, team: "AlgoConfig", updates: int, need: Any) -> None:
     if team.critic_range is not None:
         first, last = team.critic_range
         need(first < last, f"{name}.critic_range=[{first},{last}]: the first number must be below the second")
+
+
+def _check_order(name: str, team: "AlgoConfig", order: str, need: Any) -> None:
+    """What of a team can be updated agent by agent."""
+    need(
+        team.frozen or team.share_parameters == "none" or order == "simultaneous",
+        f"{name}.share_parameters=kind has one network for several agents, and no order among them: leave "
+        f"update_order={order} out",
+    )
+    need(
+        team.frozen or team.critic != "shared" or order != "sequential",
+        f"{name}.critic=shared has one target for the whole team, and update_order=sequential one for each agent in "
+        "its turn: take simultaneous or random_sequential",
+    )
 
 
 def _check_bounds(prefix: str, part: Any) -> None:

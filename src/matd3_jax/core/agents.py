@@ -8,10 +8,10 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from matd3_jax.core import critics, policies
+from matd3_jax.core import critics, policies, sharing
 from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.core.critics import Critic
-from matd3_jax.core.networks import StackedMLP
+from matd3_jax.core.networks import StackedMLP, apply
 from matd3_jax.core.policies import Policy
 from matd3_jax.envs.environment import Environment
 from matd3_jax.envs.spaces import ActionSpace
@@ -19,7 +19,7 @@ from matd3_jax.envs.spaces import ActionSpace
 
 @dataclasses.dataclass(frozen=True)
 class Group:
-    """Agents with the same observation size, action space and algorithm: one stack of networks."""
+    """Agents with the same observation size, action space and algorithm: one stack of networks, or one for all."""
 
     members: tuple[int, ...]
     observation_size: int
@@ -45,6 +45,44 @@ class Group:
     def frozen(self) -> bool:
         """Whether the members play a given policy and do not learn."""
         return self.algorithm.frozen
+
+    @property
+    def shared(self) -> bool:
+        """Whether the members have one actor, and one set of critics, together. One member alone has its own anyhow;
+        frozen ones have what they are given, each for itself."""
+        return self.algorithm.share_parameters == "kind" and len(self.members) > 1 and not self.frozen
+
+    @property
+    def team_critic(self) -> bool:
+        """Whether the members' team has one set of critics for all of it."""
+        return self.algorithm.critic == "shared" and not self.frozen
+
+    @property
+    def networks(self) -> int:
+        """Actors that the members have, and sets of critics: the leading axis of their parameters."""
+        return 1 if self.shared else len(self.members)
+
+    @property
+    def index_size(self) -> int:
+        """Inputs of their networks that say whose turn it is."""
+        return len(self.members) if self.shared else 0
+
+    def of_member(self, params: chex.ArrayTree, k: chex.Array | int) -> chex.ArrayTree:
+        """The network of member k alone, out of parameters with leading axis [networks]; it reads no index."""
+        if not self.shared:
+            return jax.tree.map(lambda leaf: leaf[k], params)
+        return sharing.network_of(jax.tree.map(lambda leaf: leaf[0], params), k, self.index_size)
+
+    def outputs(self, params: chex.ArrayTree, observations: chex.Array) -> chex.Array:
+        """What the members' actors, leading axis [networks], give [members, batch, action size] for observations
+        [members, batch, observation_size]."""
+        if not self.shared:
+            return apply(self.actors, params, observations)
+
+        def one(k: chex.Array, observation: chex.Array) -> chex.Array:
+            return apply(self.actor, self.of_member(params, k), observation)
+
+        return jax.vmap(one)(jnp.arange(len(self.members)), observations)
 
     @property
     def critic(self) -> Critic:
@@ -132,15 +170,48 @@ class JointLayout:
     @cached_property
     def groups(self) -> tuple[Group, ...]:
         """The groups, in the order of their first members."""
-        members: dict[tuple[int, ActionSpace, Algorithm], list[int]] = {}
+        members: dict[tuple[tuple[int, ActionSpace, Algorithm], str], list[int]] = {}
         for i, key in enumerate(zip(self.observation_sizes, self.action_spaces, self.algorithms, strict=True)):
-            members.setdefault(key, []).append(i)
-        return tuple(Group(tuple(who), *key) for key, who in members.items())
+            team = self.teams[i] if self.algorithms[i].within_team else ""
+            members.setdefault((key, team), []).append(i)
+        return tuple(Group(tuple(who), *key) for (key, _), who in members.items())
 
     def place(self, agent: int) -> tuple[int, int]:
         """(group number, place among its members) of an agent."""
         g = next(g for g, group in enumerate(self.groups) if agent in group.members)
         return g, self.groups[g].members.index(agent)
+
+    @cached_property
+    def minibatches(self) -> tuple[int, ...]:
+        """Number of the minibatch that each agent learns from: its own, or its team's with a critic of the team."""
+        found: dict[str | int, int] = {}
+        keys = [team if self._team_critic(i) else i for i, team in enumerate(self.teams)]
+        return tuple(found.setdefault(key, len(found)) for key in keys)
+
+    @property
+    def num_minibatches(self) -> int:
+        """How many of them there are."""
+        return max(self.minibatches) + 1
+
+    def critic_group(self, g: int) -> int:
+        """Number of the group whose state has the critics of group g: itself, or the first of a team with one set."""
+        if not self.groups[g].team_critic:
+            return g
+        teams = [self.teams[group.members[0]] for group in self.groups]
+        return teams.index(teams[g])
+
+    def team_mean(self, rewards: chex.Array) -> chex.Array:
+        """What critics learn from, [..., num_agents] as `rewards`: their agent's, or the mean of their team's."""
+        if not any(map(self._team_critic, range(self.num_agents))):
+            return rewards
+        parts = []
+        for i, team in enumerate(self.teams):
+            who = [j for j, other in enumerate(self.teams) if other == team] if self._team_critic(i) else [i]
+            parts.append(rewards[..., jnp.array(who)].mean(axis=-1))
+        return jnp.stack(parts, axis=-1)
+
+    def _team_critic(self, agent: int) -> bool:
+        return self.algorithms[agent].critic == "shared" and not self.algorithms[agent].frozen
 
     def policy(self, agent: int) -> Policy:
         """How an agent's action follows from its actor's output."""
@@ -201,7 +272,8 @@ class JointLayout:
 
     def join_actions(self, parts: Sequence[chex.Array]) -> chex.Array:
         """Joint actions [..., action_size] from one array [members, ..., size] per group."""
-        by_agent = {i: part[k] for group, part in zip(self.groups, parts, strict=True) for k, i in _numbered(group)}
+        by_group = zip(self.groups, parts, strict=True)
+        by_agent = {i: part[k] for group, part in by_group for k, i in enumerate(group.members)}
         return jnp.concatenate([by_agent[i] for i in range(self.num_agents)], axis=-1)
 
 
@@ -220,10 +292,6 @@ class RowParts:
     None with n_step = 1."""
     next_x: chex.Array
     discount: chex.Array
-
-
-def _numbered(group: Group) -> list[tuple[int, int]]:
-    return list(enumerate(group.members))
 
 
 def _starts(sizes: Sequence[int]) -> tuple[int, ...]:

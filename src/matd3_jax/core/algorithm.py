@@ -13,8 +13,12 @@ class Algorithm:
     name: str = "matd3"
     joint: bool = False
     """One agent acts in the whole team's place (TD3, DDPG)."""
-    critic: Literal["central", "own"] = "central"
-    """"central": the critics see the joint observation and all actions; "own": the agent's own parts only."""
+    critic: Literal["central", "own", "shared"] = "central"
+    """"central": the critics see the joint observation and all actions; "own": the agent's own parts only; "shared":
+    as central, and the whole team has one set of them, which learns from the mean of its rewards (HARL's MATD3)."""
+    share_parameters: Literal["none", "kind"] = "none"
+    """"kind": agents of a team with the same observation size and action space have one actor and one set of critics
+    together, whose first layers know whose turn it is (see `sharing`)."""
     num_critics: int = 2
     """The target takes the minimum over that many target critics; the actor climbs the first."""
     target_critics: int | None = None
@@ -60,6 +64,16 @@ class Algorithm:
     """The team plays a given policy, deterministically, and does not learn: it has no critics and no targets."""
     sync_targets: bool = True
     """Targets start as copies of the online networks; False: as independent draws, as in the authors' program."""
+
+    @property
+    def central(self) -> bool:
+        """Whether the critics see the joint observation and all actions."""
+        return self.critic != "own"
+
+    @property
+    def within_team(self) -> bool:
+        """Whether agents have anything in common that opponents must not share."""
+        return self.critic == "shared" or self.share_parameters == "kind"
 
     @property
     def critics_in_target(self) -> int:

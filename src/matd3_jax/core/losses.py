@@ -63,17 +63,16 @@ def target_actions(
     """a'_j = mu'_j(o'_j) + epsilon, epsilon = clip(N(0, sigma), -c, c) with smoothing, one sample for all critics of an
     agent: [batch, action size], of all agents for central critics, else of the agent itself. Of frozen teams what they
     will do: their policy, without epsilon."""
-    central = group.algorithm.critic == "central"
-    if central:
-        others = [(other, params, other.actors) for other, params in zip(layout.groups, mu_targets, strict=True)]
-    else:
-        others = [(group, own_target, group.actor)]
+    central = group.algorithm.central
+    others = zip(layout.groups, mu_targets, strict=True) if central else [(group, own_target)]
     parts = []
-    for j, (other, params, network) in enumerate(others):
+    for j, (other, params) in enumerate(others):
         if other.frozen:
             parts.append(batch.frozen_next[j])
             continue
-        part = other.policy.sample(apply(network, params, batch.next_observations[j]), noise.target[j])
+        seen = batch.next_observations[j]
+        output = other.outputs(params, seen) if central else apply(group.actor, params, seen)
+        part = other.policy.sample(output, noise.target[j])
         draw = noise.smoothing[j]
         if draw is not None:
             part = other.policy.smooth(part, draw, hyper.target_noise, hyper.target_noise_clip)

@@ -33,7 +33,8 @@ class Minibatch(NamedTuple):
     inputs: chex.Array
     """[batch, critic inputs] what the critics read: x and a, or o_i and a_i."""
     reward: chex.Array
-    """[batch] r_i; with n_step > 1 the return's sum of discounted rewards."""
+    """[batch] r_i, or its team's mean where the team has one critic; with n_step > 1 the return's sum of discounted
+    rewards."""
     discount: chex.Array
     """[batch] 0 where the episode terminated, else 1; with n_step > 1 times gamma^(m - 1)."""
     next_observations: tuple[chex.Array | None, ...]
@@ -76,7 +77,7 @@ def minibatch(
     frozen_next: tuple[chex.Array | None, ...] = (),
 ) -> Minibatch:
     """The minibatch of one member from its rows [batch, row_size]; frozen_next: see there."""
-    central = group.algorithm.critic == "central"
+    central = group.algorithm.central
     parts = layout.row_parts(rows)
 
     def part(whole: chex.Array, start: chex.Array, size: int) -> chex.Array:
@@ -93,7 +94,7 @@ def minibatch(
         observation=observation,
         action=action,
         inputs=parts.inputs if central else jnp.concatenate([observation, action], axis=-1),
-        reward=part(parts.reward, place.agent, 1)[..., 0],
+        reward=part(layout.team_mean(parts.reward), place.agent, 1)[..., 0],
         discount=parts.discount if parts.more is None else parts.discount * gamma**parts.more,
         next_observations=every_next if central else (own_next,),
         next_x=parts.next_x if central else own_next,
@@ -106,11 +107,13 @@ def draw_noise(layout: JointLayout, group: Group, shape: tuple[int, int], key: c
     """The random numbers of a group's members; `shape`: minibatches (1: shared) and their size, on each device of
     `axis` (which draws those of the whole minibatch, as one device would, and takes its own)."""
     batches, local = shape
+    if group.team_critic:
+        batches = 1  # of the team
     size = local * (1 if axis is None else jax.lax.axis_size(axis))
     members = len(group.members)
     action_key, target_key, smooth_key = jax.random.split(key, 3)
     wanted: list[tuple[Policy | None, tuple[int, ...]]]
-    if group.algorithm.critic == "central":
+    if group.algorithm.central:
         wanted = [(None if other.frozen else other.policy, (len(other.members), size)) for other in layout.groups]
     else:
         wanted, batches = [(group.policy, (size,))], members  # nobody shares an own action

@@ -41,7 +41,8 @@ class Values(NamedTuple):
     estimate: chex.Array
     """Q_i(x, a), mean over the agent's critics."""
     truth: chex.Array
-    """Discounted sum of the agent's rewards, from the state and the action on."""
+    """Discounted sum of the agent's rewards, from the state and the action on; mean of the team's where it has one
+    critic."""
 
 
 def allocate(state: Any, size: int, layout: JointLayout) -> Pairs:
@@ -78,7 +79,8 @@ def measure(
     steps: int,
 ) -> Values:
     """What the critics (parameters, one stack per group) say of the pairs, and the true values (see `play_out`)."""
-    return Values(estimate(layout, policy, critics, pairs.inputs), play_out(env, layout, policy, pairs, key, steps))
+    estimates = estimate(layout, policy, critics, pairs.inputs)
+    return Values(estimates, layout.team_mean(play_out(env, layout, policy, pairs, key, steps)))
 
 
 def estimate(
@@ -90,7 +92,7 @@ def estimate(
     if policy.statistics is not None:
         x = running_statistics.normalize(policy.statistics, x)
     values: list[Any] = [None] * layout.num_agents
-    for group, params in zip(layout.groups, critics, strict=True):
+    for g, group in enumerate(layout.groups):
         if group.frozen:
             for i in group.members:
                 values[i] = jnp.full(inputs.shape[:-1], jnp.nan)
@@ -99,7 +101,8 @@ def estimate(
             parts = [x, action]
             if group.algorithm.critic == "own":
                 parts = [layout.observation_part(x, i), layout.action_part(action, i)]
-            own = jax.tree.map(lambda leaf, k=k: leaf[k], params)
+            params = critics[layout.critic_group(g)]
+            own = jax.tree.map(lambda leaf: leaf[0], params) if group.team_critic else group.of_member(params, k)
             value = group.critic.values(own, jnp.concatenate(parts, axis=-1)).mean(axis=0)
             values[i] = value / group.algorithm.reward_scale
     return jnp.stack(values, axis=-1)

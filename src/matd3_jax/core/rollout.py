@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from matd3_jax.core import frozen, networks, running_statistics
+from matd3_jax.core import frozen, running_statistics
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.frozen import Scale
@@ -23,7 +23,7 @@ class PolicyParams(NamedTuple):
     """All that acting takes, of one seed."""
 
     actors: tuple[chex.ArrayTree, ...]
-    """Parameters, one stack per group."""
+    """Parameters, one stack [networks, ...] per group."""
     hyper: tuple[HyperParams, ...]
     """One per group."""
     statistics: Statistics | None
@@ -238,7 +238,7 @@ def act(
             parts.append(draws[g])
             continue
         stacked = jnp.stack([observation[i] for i in group.members])
-        output = networks.apply(group.actors, policy.actors[g], stacked)
+        output = group.outputs(policy.actors[g], stacked)
         draw = None if draws is None else draws[g]
         sigma = policy.hyper[g].exploration_noise
         if group.algorithm.noise_range:

@@ -9,7 +9,6 @@ import numpy as np
 
 from matd3_jax.core.agents import Group, JointLayout
 from matd3_jax.core.minibatch import Minibatch, Noise
-from matd3_jax.core.networks import apply
 
 ORDER = 2**31 - 1
 """What the order's key is folded from the update's with, apart from all keys that are split off it."""
@@ -73,7 +72,7 @@ def by_policies(
             parts.append(jnp.stack([layout.action_part(replayed, i) for i in other.members]))
             continue
         seen = jnp.stack([layout.observation_part(x, i) for i in other.members])
-        parts.append(other.policy.sample(apply(other.actors, params, seen), noise.target[j]))
+        parts.append(other.policy.sample(other.outputs(params, seen), noise.target[j]))
     joint = jax.lax.stop_gradient(layout.join_actions(parts))
     start = batch.action_column - layout.observation_size
     own = jax.lax.dynamic_slice_in_dim(joint, start, group.action_space.size, axis=-1)

@@ -7,20 +7,22 @@ import chex
 import jax
 import jax.numpy as jnp
 import optax
-from jax.flatten_util import ravel_pytree
 
-from matd3_jax.core import losses, minibatch, networks, optimizer, sequential_actors
+from matd3_jax.core import losses, minibatch, networks, optimizer, sequential_actors, team_critic
+from matd3_jax.core.agent_update import move_actor, update_agent, update_together
 from matd3_jax.core.agents import Group, JointLayout
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.frozen import Scale, unscaled
-from matd3_jax.core.minibatch import Minibatch, Noise, Place
+from matd3_jax.core.minibatch import Minibatch, Place
 
 UNROLLED_MEMBERS = 4
 """Members of a group that a program holds one after another, instead of in a loop; more take longer to compile."""
 
 
 class GroupState(NamedTuple):
-    """Networks and optimizers of one group. Leaves have leading axes [members], critics [members, critics]."""
+    """Networks and optimizers of one group. Leaves have leading axes [networks], critics [networks, critics]: one for
+    each member, or one for all (`Group.networks`). A team's one set of critics is in its first group; others have None.
+    """
 
     actor: chex.ArrayTree
     critic: chex.ArrayTree
@@ -46,7 +48,8 @@ class UpdateMetrics(NamedTuple):
 
 
 def critic_input_size(layout: JointLayout, group: Group) -> int:
-    if group.algorithm.critic == "central":
+    """Entries of what the critics of a group's agents read."""
+    if group.algorithm.central:
         return layout.observation_size + layout.action_size
     return group.observation_size + group.action_space.size
 
@@ -56,7 +59,8 @@ def init(layout: JointLayout, key: chex.PRNGKey) -> tuple[GroupState, ...]:
 
     def one(group: Group, key: chex.PRNGKey) -> GroupState:
         algorithm, keys = group.algorithm, jax.random.split(key, 4)
-        observation, inputs = jnp.zeros((1, group.observation_size)), critic_input_size(layout, group)
+        observation = jnp.zeros((1, group.observation_size + group.index_size))
+        inputs = critic_input_size(layout, group) + (0 if group.team_critic else group.index_size)
         if group.frozen:
             mu, nothing = group.actor.init(keys[0], observation)["params"], (None,) * 6
             one = jax.tree.map(lambda leaf: leaf[0], unscaled(1, group.observation_size))
@@ -73,10 +77,15 @@ def init(layout: JointLayout, key: chex.PRNGKey) -> tuple[GroupState, ...]:
         return GroupState(mu, q, mu_target, q_target, adam.init(mu), adam.init(q), average)
 
     keys = jax.random.split(key, layout.num_agents)
-    return tuple(
-        jax.vmap(lambda k, group=group: one(group, k))(keys[jnp.array(group.members)])  # type: ignore[misc]
+    state = [
+        jax.vmap(lambda k, group=group: one(group, k))(keys[jnp.array(group.members[: group.networks])])  # type: ignore[misc]
         for group in layout.groups
-    )
+    ]
+    for g, group in enumerate(layout.groups):
+        if group.team_critic:
+            first = {part: jax.tree.map(lambda leaf: leaf[:1], getattr(state[g], part)) for part in team_critic.PARTS}
+            state[g] = state[g]._replace(**first) if layout.critic_group(g) == g else team_critic.without(state[g])
+    return tuple(state)
 
 
 def update(
@@ -96,11 +105,12 @@ def update(
 
     Args:
         state, hyper: one element per group.
-        rows: replay rows [num_agents, batch, row_size], a minibatch for each agent, or [1, batch, row_size] for all;
-            with n_step > 1 as `n_step.draw` gives them.
+        rows: replay rows [minibatches, batch, row_size], a minibatch for each agent or for those of a team with one set
+            of critics (`JointLayout.minibatches`), or [1, batch, row_size] for all; with n_step > 1 as `n_step.draw`
+            gives them.
         move: for each group whether this update moves actors and targets too (every policy_delay-th does).
         sequential: later agents see the earlier ones' moved target actors (the authors' program) instead of all
-            learning from the same state.
+            learning from the same state; not where agents share a network.
         one_by_one: compute the agents of a group one after another instead of in one batch: the same numbers, while
             one agent's activations stay in a CPU's cache.
         axis: mesh axis whose devices share the work of each minibatch: `rows` are this device's equal part of it (the
@@ -117,10 +127,14 @@ def update(
         for group, k in zip(layout.groups, keys, strict=True)
     ]
     new, metrics = list(state), jnp.full((3, layout.num_agents), jnp.nan)
+    own_minibatches = layout.num_minibatches == layout.num_agents
 
     def cut(g: int, place: Place) -> Minibatch:
         def own(whole: chex.Array) -> chex.Array:
-            return whole[0] if rows.shape[0] == 1 else jax.lax.dynamic_index_in_dim(whole, place.agent, keepdims=False)
+            if rows.shape[0] == 1:
+                return whole[0]
+            number = place.agent if own_minibatches else jnp.array(layout.minibatches)[place.agent]
+            return jax.lax.dynamic_index_in_dim(whole, number, keepdims=False)
 
         others = jax.tree.map(own, frozen_next)
         return minibatch.minibatch(layout, layout.groups[g], own(rows), place, hyper[g].gamma, others)
@@ -139,19 +153,69 @@ def update(
             state, own_target, batch, noise = args
             batch = cut(g, batch) if one_by_one else batch
             moves = move[g] and not random_order
-            return _update_agent(
+            return update_agent(
                 layout, layout.groups[g], hyper[g], moves, axis, targets, state, own_target, batch, noise, next_action
             )
 
         return f
 
-    def move_actor(g: int, k: chex.Array, states: tuple) -> tuple[tuple, chex.Array]:
-        """Of member k of a group, against the policies in `states`."""
+    def together(
+        g: int,
+        state: GroupState,
+        next_action: chex.Array | None = None,
+        critic: chex.ArrayTree | None = None,
+        inputs: chex.Array | None = None,
+    ) -> tuple[GroupState, tuple]:
+        """All members of a group that share their networks; `critic` of their team, and what it reads."""
+
+        def read(batch: Place | Minibatch) -> Minibatch:
+            whole = cut(g, batch) if isinstance(batch, Place) else batch
+            return whole if inputs is None else whole._replace(inputs=inputs)
+
+        group, own = layout.groups[g], jax.tree.map(lambda leaf: leaf[0], state)
+        agents = jnp.arange(len(group.members)), minibatches(g), noises[g]
+        how = (one_by_one, _unrolled(len(group.members), rows.shape[1]))
+        own, m = update_together(
+            layout, group, hyper[g], move[g], axis, mu_targets, own, agents, read, how, next_action, critic
+        )
+        return jax.tree.map(lambda leaf: leaf[None], own), m
+
+    def of_team(g: int) -> None:
+        """The critics of a team whose first group this is, and its actors unless they move later, in `new`."""
+        nonlocal metrics
+        groups = [h for h in range(len(layout.groups)) if layout.critic_group(h) == g]
+        place, noise = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], (places[g], noises[g]))
+        how, common = (hyper[g], move[g], axis, mu_targets), cut(g, place)
+        new[g], loss, q_value = team_critic.update(layout, g, *how, state[g], common, noise)
+        critic = jax.tree.map(lambda leaf: leaf[0], new[g].critic)
+        for h in groups:
+            who = jnp.array(layout.groups[h].members)
+            metrics = metrics.at[0, who].set(loss).at[1, who].set(q_value)
+            if not move[h] or random_order:
+                continue
+            actors = team_critic.without(state[h])
+            if layout.groups[h].shared:
+                actors, (*_, mu_loss) = together(h, actors, critic=critic, inputs=common.inputs)
+            else:
+
+                def one(args, h=h):
+                    own, batch, noise = args
+                    batch = (cut(h, batch) if one_by_one else batch)._replace(inputs=common.inputs)
+                    return move_actor(layout, layout.groups[h], hyper[h], axis, own, batch, noise, critic)
+
+                args = (actors, minibatches(h), noises[h])
+                actors, mu_loss = _each_member(one, args, one_by_one, rows.shape[1])
+            new[h] = actors._replace(**{part: getattr(new[h], part) for part in team_critic.PARTS})
+            metrics = metrics.at[2, who].set(mu_loss)
+
+    def move_one(g: int, k: chex.Array, states: tuple) -> tuple[tuple, chex.Array]:
+        """Actor of member k of a group, against the policies in `states`."""
         own, place, noise = jax.tree.map(lambda leaf: jnp.asarray(leaf)[k], (states[g], places[g], noises[g]))
         batch, group = cut(g, place), layout.groups[g]
-        if group.algorithm.critic == "central":
+        if group.algorithm.central:
             batch = sequential_actors.by_policies(layout, group, [s.actor for s in states], batch, noise)
-        own, loss = _move_actor(layout, group, hyper[g], axis, own, batch, noise)
+        critic = jax.tree.map(lambda leaf: leaf[0], new[layout.critic_group(g)].critic) if group.team_critic else None
+        own, loss = move_actor(layout, group, hyper[g], axis, own, batch, noise, critic)
         after = jax.tree.map(lambda old, one: old.at[k].set(one), states[g], own)
         return (*states[:g], after, *states[g + 1 :]), loss
 
@@ -169,19 +233,34 @@ def update(
         for g, group in enumerate(layout.groups):
             if group.frozen:
                 continue
+            if group.team_critic:
+                if layout.critic_group(g) == g:
+                    of_team(g)
+                continue
             args = (state[g], mu_targets[g], minibatches(g), noises[g])
             next_action = None
-            if rows.shape[0] == 1 and group.algorithm.critic == "central":
+            if rows.shape[0] == 1 and group.algorithm.central:
                 # One minibatch for all: its target actions are the same for every member, so compute them once.
                 _, own_target, batch, noise = jax.tree.map(lambda leaf: leaf[0], args)
                 batch = cut(g, batch) if one_by_one else batch
                 next_action = losses.target_actions(layout, group, hyper[g], mu_targets, own_target, batch, noise)
-            new[g], m = _each_member(member(g, mu_targets, next_action), args, one_by_one, rows.shape[1])
+            if group.shared:
+                new[g], m = together(g, state[g], next_action)
+            else:
+                new[g], m = _each_member(member(g, mu_targets, next_action), args, one_by_one, rows.shape[1])
             metrics = metrics.at[:, jnp.array(group.members)].set(jnp.stack(m))
     moving = [i for i in layout.learners if move[layout.place(i)[0]]]
     if random_order and moving:
-        moved, actor_losses = sequential_actors.move(layout, key, tuple(new), moving, move_actor)
-        new = list(moved)
+        alone = tuple(
+            team_critic.without(own) if group.team_critic else own
+            for group, own in zip(layout.groups, new, strict=True)
+        )
+        moved, actor_losses = sequential_actors.move(layout, key, alone, moving, move_one)
+        critics = [{part: getattr(own, part) for part in team_critic.PARTS} for own in new]
+        new = [
+            own._replace(**parts) if group.team_critic else own
+            for group, own, parts in zip(layout.groups, moved, critics, strict=True)
+        ]
         metrics = metrics.at[2].set(actor_losses)
     return tuple(new), UpdateMetrics(*metrics)
 
@@ -189,79 +268,13 @@ def update(
 def _each_member(f: Callable, args: chex.ArrayTree, one_by_one: bool, batch: int) -> chex.ArrayTree:
     """`f` of each member of a group, stacked: all at once, or one by one."""
     members = jax.tree.leaves(args)[0].shape[0]
-    if one_by_one and members <= UNROLLED_MEMBERS and networks.small_batch(batch):
+    if one_by_one and _unrolled(members, batch):
         # A loop would copy each member's state out of the stack and back, 6 % of an update with 256 transitions.
         each = [f(jax.tree.map(lambda leaf, k=k: leaf[k], args)) for k in range(members)]
         return jax.tree.map(lambda *parts: jnp.stack(parts), *each)
     return jax.lax.map(f, args, batch_size=None if one_by_one else members)
 
 
-def _update_agent(
-    layout: JointLayout,
-    group: Group,
-    hyper: HyperParams,
-    move: bool,
-    axis: str | None,
-    mu_targets: Sequence[chex.ArrayTree],
-    state: GroupState,
-    own_target: chex.ArrayTree,
-    batch: Minibatch,
-    noise: Noise,
-    next_action: chex.Array | None = None,
-) -> tuple[GroupState, tuple[chex.Array, chex.Array, chex.Array]]:
-    """One agent: its state, and (critic loss, Q, actor loss). `state`: without the members' axis; `next_action`: the
-    target actions, where they are known already."""
-    algorithm = group.algorithm
-    if next_action is None:
-        next_action = losses.target_actions(layout, group, hyper, mu_targets, own_target, batch, noise)
-    y = losses.td_target(layout, group, hyper, state.critic_target, batch, next_action, noise.critics)
-
-    critic_gradient = jax.grad(lambda params: losses.critic_loss(group, params, batch, y), has_aux=True)
-    gradients, (loss, q_value) = _mean_over(axis, critic_gradient(state.critic))
-    q_params, q_optimizer = optimizer.apply(
-        algorithm, state.critic, state.critic_optimizer, gradients, hyper.critic_lr, hyper.max_grad_norm, stack_ndim=1
-    )
-    state = state._replace(critic=q_params, critic_optimizer=q_optimizer)
-    if not move:
-        return state, (loss, q_value, jnp.full((), jnp.nan))
-    state, mu_loss = _move_actor(layout, group, hyper, axis, state, batch, noise)
-    return state, (loss, q_value, mu_loss)
-
-
-def _move_actor(
-    layout: JointLayout,
-    group: Group,
-    hyper: HyperParams,
-    axis: str | None,
-    state: GroupState,
-    batch: Minibatch,
-    noise: Noise,
-) -> tuple[GroupState, chex.Array]:
-    """Actor and targets of one agent, whose critics have learned already: its state, and the actor loss."""
-    algorithm, q_params = group.algorithm, state.critic
-    actor_gradient = jax.grad(
-        lambda params: losses.actor_loss(layout, group, hyper, params, q_params, batch, noise), has_aux=True
-    )
-    gradients, mu_loss = _mean_over(axis, actor_gradient(state.actor))
-    mu_params, mu_optimizer = optimizer.apply(
-        algorithm, state.actor, state.actor_optimizer, gradients, hyper.actor_lr, hyper.max_grad_norm, stack_ndim=0
-    )
-    # theta' <- tau theta + (1 - tau) theta'
-    state = state._replace(
-        actor=mu_params,
-        actor_optimizer=mu_optimizer,
-        actor_target=optax.incremental_update(mu_params, state.actor_target, hyper.tau),
-        critic_target=optax.incremental_update(q_params, state.critic_target, hyper.tau),
-    )
-    if algorithm.actor_average:
-        average = optax.incremental_update(mu_params, state.actor_average, algorithm.actor_average)
-        state = state._replace(actor_average=average)
-    return state, mu_loss
-
-
-def _mean_over(axis: str | None, tree: chex.ArrayTree) -> chex.ArrayTree:
-    """Means over the devices of the axis, as one vector: each array by itself costs a meeting of all devices."""
-    if axis is None:
-        return tree
-    flat, restored = ravel_pytree(tree)
-    return restored(jax.lax.pmean(flat, axis))
+def _unrolled(members: int, batch: int) -> bool:
+    """Whether members that are computed one by one have no loop."""
+    return members <= UNROLLED_MEMBERS and networks.small_batch(batch)

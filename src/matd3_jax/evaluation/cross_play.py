@@ -12,7 +12,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
-from matd3_jax.core import rollout
+from matd3_jax.core import rollout, sharing
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.core.rollout import PolicyParams
@@ -101,7 +101,8 @@ def team_of(training: TrainingSession, env: Environment, state: TrainState, team
     for group in own.layout.groups:
         found = [whole.place(who[i]) for i in group.members]
         g, rows = found[0][0], [row for _, row in found]
-        actors.append(jax.tree.map(lambda leaf, rows=rows: leaf[:, rows], policy.actors[g]))
+        each = sharing.apart(whole.groups[g], policy.actors[g])
+        actors.append(jax.tree.map(lambda leaf, rows=rows: np.asarray(leaf)[:, rows], each))
         hyper.append(policy.hyper[g])
         scale = policy.scales[g] if policy.scales else None
         scales.append(jax.tree.map(lambda leaf, rows=rows: leaf[:, rows], scale))

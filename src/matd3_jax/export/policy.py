@@ -51,7 +51,7 @@ def function(layout: JointLayout, policy: PolicyParams, agent: int) -> Callable[
     """
     g, k = layout.place(agent)
     group = layout.groups[g]
-    params = jax.tree.map(lambda leaf: jnp.asarray(leaf[k]), policy.actors[g])
+    params = jax.tree.map(jnp.asarray, group.of_member(policy.actors[g], k))
 
     def one(observation: chex.Array) -> dict[str, chex.Array]:
         seen = observation[None]
@@ -90,7 +90,8 @@ def perceptron(layout: JointLayout, policy: PolicyParams, agent: int, format: st
             f"format={format} knows squashed actions and choices; the policy of {name} is a {type(head).__name__}: "
             "format=saved_fn holds any policy"
         )
-    params = {key: np.asarray(leaf[k], np.float32) for key, leaf in policy.actors[g].items()}
+    own = group.of_member(policy.actors[g], k)  # that its index is a bias of, where it shares its actor
+    params = {key: np.asarray(leaf, np.float32) for key, leaf in own.items()}
     layers = range(len(network.features))
     mean, deviation = normalization(layout, policy, agent) or (None, None)
     return Perceptron(

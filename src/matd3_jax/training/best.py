@@ -148,7 +148,7 @@ def played(checkpoint: Path, state: TrainState, seeds: int) -> tuple[TrainState,
     paths, structure = jax.tree_util.tree_flatten_with_path(part)
     part = jax.tree.unflatten(structure, [new[jax.tree_util.keystr(path)] for path, _ in paths])
     groups = tuple(
-        old if old.critic is None else one  # a team that does not learn stays as it is
+        old if old.scale is not None else one  # a team that does not learn stays as it is
         for old, one in zip(state.groups, part.groups, strict=True)
     )
     return state._replace(groups=groups, statistics=part.statistics), found
@@ -159,7 +159,7 @@ def kept(state: TrainState) -> TrainState:
 
     def actors(group: GroupState) -> GroupState:
         nothing: Any = None
-        if group.critic is None:
+        if group.scale is not None:  # of a team that does not learn
             return GroupState(*(nothing for _ in GroupState._fields))
         return GroupState(group.actor, *(nothing,) * 5, actor_average=group.actor_average)
 

@@ -37,9 +37,7 @@ def acting_flops(layout: JointLayout) -> float:
 def update_flops(layout: JointLayout, schedule: Schedule) -> float:
     """Floating point operations of the matrix products in one update of one seed, all agents, actors counted as often
     as they move."""
-    return (
-        2.0 * schedule.batch_size * sum(len(g.members) * _member(layout, schedule, g) for g in layout.learning_groups)
-    )
+    return 2.0 * schedule.batch_size * sum(_group(layout, schedule, group) for group in layout.learning_groups)
 
 
 def step_flops(layout: JointLayout, schedule: Schedule) -> float:
@@ -48,17 +46,27 @@ def step_flops(layout: JointLayout, schedule: Schedule) -> float:
     return acting_flops(layout) + updates * update_flops(layout, schedule)
 
 
-def _member(layout: JointLayout, schedule: Schedule, group: Group) -> float:
-    """Multiplications of one agent's update, for each transition: see `core.losses`."""
+def _group(layout: JointLayout, schedule: Schedule, group: Group) -> float:
+    """Multiplications of an update of a group's agents, for each transition: see `core.losses`. Those of a team's one
+    set of critics count to its first group."""
+    critics, actor = _member(layout, schedule, group)
+    members = len(group.members)
+    g = layout.groups.index(group)
+    sets = members if not group.team_critic else int(layout.critic_group(g) == g)
+    return sets * critics + members * actor
+
+
+def _member(layout: JointLayout, schedule: Schedule, group: Group) -> tuple[float, float]:
+    """(of a set of critics, of an actor)."""
     algorithm, size = group.algorithm, group.action_space.size
     actor, critic = (
         _actor(group),
         (update.critic_input_size(layout, group), *group.algorithm.hidden, group.critic.num_outputs),
     )
     target_actions = _forward(actor)
-    if algorithm.critic == "central":
+    if algorithm.central:
         target_actions = sum(len(other.members) * _forward(_actor(other)) for other in layout.groups)
-        if schedule.shared_minibatch and not schedule.sequential:
+        if schedule.shared_minibatch and not schedule.sequential and not group.team_critic:
             target_actions /= len(group.members)
     targets, climbed = algorithm.critics_in_target, algorithm.critics_climbed
     # The targets' values; the critics' own, and their gradients.
@@ -70,9 +78,13 @@ def _member(layout: JointLayout, schedule: Schedule, group: Group) -> float:
     actors = 2 * _forward(actor) + _inputs(actor) + climbed * (through + slopes)
     if algorithm.adversarial and algorithm.critic_head != "categorical":
         actors -= climbed * critic[-2] * critic[-1]  # the slope of a mean needs no outputs
-    if schedule.random_order and algorithm.critic == "central":  # everybody's actions in x, by the policies of now
+    if schedule.random_order and algorithm.central:  # everybody's actions in x, by the policies of now
         actors += sum(len(other.members) * _forward(_actor(other)) for other in layout.learning_groups)
-    return target_actions + critics + targets * slopes + actors / algorithm.policy_delay
+    judging = target_actions + critics + targets * slopes
+    if group.team_critic and not schedule.random_order:  # all actors climb one product of what was replayed
+        once = climbed * critic[0] * critic[1]
+        judging, actors = judging + once / algorithm.policy_delay, actors - once
+    return judging, actors / algorithm.policy_delay
 
 
 def _actor(group: Group) -> tuple[int, ...]:
@@ -184,7 +196,7 @@ def expectation(training: TrainingSession, done: int = 0) -> str:
     if training.processes.size > 1 or not trainer.on_cpu:
         where = "several processes" if training.processes.size > 1 else "an accelerator"
         return f"expected: not estimated for {where}; the first interval shows the rate and the time left"
-    group = max(layout.learning_groups, key=lambda g: len(g.members) * _member(layout, schedule, g))
+    group = max(layout.learning_groups, key=lambda g: _group(layout, schedule, g))
     critic = (update.critic_input_size(layout, group), *group.algorithm.hidden, group.critic.num_outputs)
     layer = max(pairwise(critic), key=lambda sizes: sizes[0] * sizes[1])
     # Larger products are done at the same rate, and take longer to measure.

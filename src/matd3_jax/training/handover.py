@@ -134,7 +134,7 @@ def critic_columns(source: str, team: Team, there: JointLayout, here: JointLayou
 
     Raises UserError where the agents' critics see what those of agent `one` do not.
     """
-    central = here.algorithms[one].critic == "central"
+    central = here.algorithms[one].central
     observations, actions = here.observation_size, here.observation_starts[one]
     if not central:
         observations, actions = here.observation_sizes[one], 0
@@ -154,7 +154,7 @@ def critic_columns(source: str, team: Team, there: JointLayout, here: JointLayou
             place[agent] = (seen, list(range(start, start + here.action_spaces[other].size)))
     found = []
     for agent in team.agents:
-        read = range(there.num_agents) if there.algorithms[agent].critic == "central" else [agent]
+        read = range(there.num_agents) if there.algorithms[agent].central else [agent]
         if unseen := [there.agents[i] for i in read if i not in place]:
             raise UserError(
                 f"{source}: the critics of {there.agents[agent]} see {unseen[0]}, those of {here.agents[one]} do not: "

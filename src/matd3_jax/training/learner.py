@@ -49,7 +49,7 @@ class Learner:
         first of them."""
         schedule, groups = self.schedule, self.layout.groups
         size = replay.filled(schedule.replay_capacity, schedule.rollout_steps, state.rollouts)
-        batches = 1 if schedule.shared_minibatch else self.layout.num_agents
+        batches = 1 if schedule.shared_minibatch else self.layout.num_minibatches
         unrolled = math.gcd(self.period, schedule.updates_per_collect)
         axis = self.sharding.minibatch_axis
 

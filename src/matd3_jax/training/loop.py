@@ -70,6 +70,8 @@ class TrainLoop:
             delay = group.algorithm.policy_delay
             if updates % delay and delay % updates:
                 raise ValueError(f"updates_per_collect={updates} and policy_delay={delay}: one must divide the other")
+            if (group.shared or group.team_critic) and schedule.sequential or group.shared and schedule.random_order:
+                raise ValueError("agents that share a network have no order in which they learn")
         if env.on_host:  # a seed's copies are stepped once: several devices would each step their own
             devices_per_seed = 1
         sharding = SeedSharding(num_seeds, schedule.batch_size, devices, devices_per_seed, seeds_together)

@@ -137,7 +137,7 @@ def update_bytes(trainer: TrainLoop) -> int:
         + layout.action_size
         for group in layout.learning_groups
     )
-    rows = layout.num_agents * layout.row_size  # gathered for all agents at once
+    rows = layout.num_minibatches * layout.row_size  # gathered for all agents at once
     noise = layout.num_agents * 3 * layout.action_size
     return 4 * schedule.batch_size * (2 * rows + noise + agents * 4 * widest)
 

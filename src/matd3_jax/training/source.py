@@ -1,6 +1,7 @@
 """Networks of other runs, taken out agent by agent and laid out for a run that begins with them."""
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +11,8 @@ import numpy as np
 from matd3_jax import envs
 from matd3_jax.config import Config
 from matd3_jax.config.schema import AlgoConfig
-from matd3_jax.core.agents import JointLayout
+from matd3_jax.core import sharing
+from matd3_jax.core.agents import Group, JointLayout
 from matd3_jax.core.frozen import Scale
 from matd3_jax.core.running_statistics import CLIP, LEAST_VARIANCE, Statistics
 from matd3_jax.core.update import GroupState
@@ -84,26 +86,36 @@ class Source:
         number = self.layout.agents.index(agent)
         return (number, *self.layout.place(number))
 
-    def networks(self, agent: str) -> GroupState:
-        """All that is trained on of an agent, leading axis [seeds]."""
-        _, g, k = self.place(agent)
-        group = self.state.groups[g]
-        if group.critic is None:
-            raise UserError(f"{self.name}: {agent} did not learn there and has no critics")
-        found = group._replace(actor_optimizer=None, critic_optimizer=None)  # type: ignore[arg-type]
+    def networks(self, agents: Sequence[str], shared: bool) -> GroupState:
+        """All that is trained on, leading axis [seeds]: the networks of the first of some agents, also out of those
+        that it shares there, or with `shared` those that all of them share."""
+        _, g, k = self.place(agents[0])
+        group, found = self.layout.groups[g], self.state.groups[g]
+        if group.frozen:
+            raise UserError(f"{self.name}: {agents[0]} did not learn there and has no critics")
+        if shared and not (group.shared and [self.layout.agents[i] for i in group.members] == list(agents)):
+            raise UserError(f"{self.name}: {', '.join(agents)} have one network together here, and not there")
         if self.policies is not self.state:  # of best evaluations there are actors alone
             best = self.policies.groups[g]
             found = found._replace(actor=best.actor, actor_target=best.actor, actor_average=best.actor_average)
-        return self._taken(found, k)
+        owner = self.state.groups[self.layout.critic_group(g)]
+        critics = {"critic": owner.critic, "critic_target": owner.critic_target}
+        actors = {name: getattr(found, name) for name in ("actor", "actor_target", "actor_average")}
+        one = self._first if shared else partial(self._own, group, k)
+        taken = {name: one(params) for name, params in actors.items()}
+        taken |= {name: (self._first if group.team_critic else one)(params) for name, params in critics.items()}
+        return _nothing(GroupState)._replace(**taken)
 
     def actor(self, agent: str) -> tuple[Any, Scale]:
         """What an agent plays when it is evaluated there: parameters, and how it sees observations; leading axis
         [seeds]."""
         number, g, k = self.place(agent)
         group = self.policies.groups[g]
-        played = self._taken(group.actor if group.actor_average is None else group.actor_average, k)
+        played = self._own(
+            self.layout.groups[g], k, group.actor if group.actor_average is None else group.actor_average
+        )
         if group.scale is not None:
-            return played, self._taken(group.scale, k)
+            return played, self._own(self.layout.groups[g], k, group.scale)
         size, seeds = self.layout.observation_sizes[number], len(self.rows)
         statistics = self.training.trainer.learner.scale(self.policies)
         if statistics is None:
@@ -118,8 +130,14 @@ class Source:
         number, *_ = self.place(agent)
         return Statistics(*(self.layout.observation_part(np.asarray(leaf)[self.rows], number) for leaf in statistics))
 
-    def _taken(self, tree: Any, member: int) -> Any:
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[self.rows, member], tree)
+    def _own(self, group: Group, member: int, tree: Any) -> Any:
+        """A member's part [seeds, ...] of what its group has; a network without an index."""
+        each = tree if tree is None else sharing.apart(group, tree)
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[self.rows, member], each)
+
+    def _first(self, tree: Any) -> Any:
+        """The one network [seeds, ...] that several have."""
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[self.rows, 0], tree)
 
 
 def of(settings: Config, training: TrainingSession) -> "Leaves":
@@ -143,21 +161,10 @@ def of(settings: Config, training: TrainingSession) -> "Leaves":
         if group.frozen:
             groups.append(_frozen(settings, algo, layout, group.members, wanted, seeds, env))
         elif init is not None:
-            members = []
             for name, number in zip(names, group.members, strict=True):
-                if _hands_over(init, name):
-                    found = _handed_over(init, layout, number)
-                else:
+                if not _hands_over(init, name):
                     _check_actions(init, layout, number)
-                    found = init.networks(name)
-                if wanted.actor_average is None:
-                    found = found._replace(actor_average=None)
-                elif found.actor_average is None:
-                    found = found._replace(actor_average=found.actor)
-                for part in NETWORKS:
-                    _check_shapes(init.name, part, name, getattr(found, part), getattr(wanted, part))
-                members.append(found)
-            groups.append(_stacked(members))
+            groups.append(_begun(init, layout, group, names, wanted))
         else:
             groups.append(_nothing(GroupState))
     start = _nothing(TrainState)._replace(groups=tuple(groups))
@@ -174,6 +181,33 @@ def of(settings: Config, training: TrainingSession) -> "Leaves":
     return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_flatten_with_path(start)[0]}
 
 
+def _begun(init: Source, layout: JointLayout, group: Group, names: Sequence[str], wanted: GroupState) -> GroupState:
+    """The networks of a group that begins with those of another run."""
+    members, team = [], {}
+    for name in names[: group.networks]:
+        if _hands_over(init, name):
+            found = _handed_over(init, layout, layout.agents.index(name))
+        else:
+            found = init.networks(names if group.shared else [name], group.shared)
+        if wanted.actor_average is None:
+            found = found._replace(actor_average=None)
+        elif found.actor_average is None:
+            found = found._replace(actor_average=found.actor)
+        if wanted.critic is None:  # the team's first group has them
+            found = found._replace(critic=None, critic_target=None)
+        for part in NETWORKS:
+            _check_shapes(init.name, part, name, getattr(found, part), getattr(wanted, part))
+        members.append(found)
+    if group.team_critic:
+        _, g, _ = init.place(names[0])
+        if not init.layout.groups[g].team_critic:
+            raise UserError(f"{init.name}: the team of {names[0]} has one set of critics here, and not there")
+        of_team = members[0]
+        members = [found._replace(critic=None, critic_target=None) for found in members]
+        team = {part: _stacked([getattr(of_team, part)]) for part in ("critic", "critic_target")}
+    return _stacked(members)._replace(**team)
+
+
 def _hands_over(source: Source, name: str) -> bool:
     """Whether an agent is one in the place of a team whose agents learned there."""
     return name not in source.layout.agents and name in source.layout.teams
@@ -182,7 +216,7 @@ def _hands_over(source: Source, name: str) -> bool:
 def _handed_over(source: Source, layout: JointLayout, agent: int) -> GroupState:
     """The networks of the agents of a team as those of one agent in their place."""
     team = handover.Team.of(source.name, layout.agents[agent], source.layout, source.training.env)
-    each = [source.networks(source.layout.agents[i]) for i in team.agents]
+    each = [source.networks([source.layout.agents[i]], shared=False) for i in team.agents]
     return handover.networks(source.name, team, each, source.layout, layout, agent)
 
 
@@ -258,7 +292,7 @@ def _paths(tree: Any) -> Iterator[tuple[str, Any]]:
         yield ".".join(str(getattr(key, "key", key)) for key in path), leaf
 
 
-def _stacked(members: Sequence[GroupState]) -> GroupState:
+def _stacked(members: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *members)
 
 
