@@ -14,6 +14,7 @@ from ledger import ENDS, HYPER, LIMIT, Ledger, by_hand
 from matd3_jax.core import rollout, update
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
+from matd3_jax.envs.point_reach import PointReach
 from matd3_jax.training import sharding
 from matd3_jax.training.evaluator import Evaluator
 from matd3_jax.training.loop import TrainLoop
@@ -339,3 +340,30 @@ def test_evaluate():
     most = lengths * (lengths + 1) / 2
     assert (returns[..., 0] > 0).all() and (returns[..., 0] < most).all()
     assert (returns[..., 1] > 10 * lengths).all() and (returns[..., 1] < 10 * lengths + most).all()
+
+
+class Rivals(PointReach):
+    """Two agents alike in two teams."""
+
+    @property
+    def teams(self):
+        return ("agents", "adversaries")
+
+
+def test_teams_that_are_alike_learn_with_their_own_numbers():
+    """Same sizes, spaces and algorithm, but one of them has a learning rate of 0."""
+    still = HYPER._replace(actor_lr=0.0, critic_lr=0.0)
+    layout = JointLayout.of(Rivals(), {"agents": MATD3, "adversaries": MATD3})
+    hyper = {"agents": HYPER._replace(actor_lr=0.1, critic_lr=0.1), "adversaries": still}
+    trainer = TrainLoop(Rivals(), layout, SCHEDULE, hyper, 1)
+    before, _ = start(trainer, [0])
+    before = plain(before.groups)
+    state, _ = start(trainer, [0])
+    state, _ = trainer.interval(2)(state)
+    (g, k), (h, m) = (layout.place(i) for i in range(2))
+    for part in ("actor", "critic"):
+        mine, rival = (
+            [getattr(groups[one], part)["kernel_0"][0, member] for groups in (before, plain(state.groups))]
+            for one, member in ((g, k), (h, m))
+        )
+        assert (mine[0] != mine[1]).any() and (rival[0] == rival[1]).all()

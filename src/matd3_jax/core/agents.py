@@ -19,7 +19,8 @@ from matd3_jax.envs.spaces import ActionSpace
 
 @dataclasses.dataclass(frozen=True)
 class Group:
-    """Agents with the same observation size, action space and algorithm: one stack of networks, or one for all."""
+    """Agents of a team with the same observation size, action space and algorithm: one stack of networks, or one for
+    all."""
 
     members: tuple[int, ...]
     observation_size: int
@@ -169,11 +170,10 @@ class JointLayout:
 
     @cached_property
     def groups(self) -> tuple[Group, ...]:
-        """The groups, in the order of their first members."""
+        """The groups, in the order of their first members; teams have hyper-parameters, and so groups, of their own."""
         members: dict[tuple[tuple[int, ActionSpace, Algorithm], str], list[int]] = {}
         for i, key in enumerate(zip(self.observation_sizes, self.action_spaces, self.algorithms, strict=True)):
-            team = self.teams[i] if self.algorithms[i].within_team else ""
-            members.setdefault((key, team), []).append(i)
+            members.setdefault((key, self.teams[i]), []).append(i)
         return tuple(Group(tuple(who), *key) for (key, _), who in members.items())
 
     def place(self, agent: int) -> tuple[int, int]:

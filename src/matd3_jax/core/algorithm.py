@@ -71,11 +71,6 @@ class Algorithm:
         return self.critic != "own"
 
     @property
-    def within_team(self) -> bool:
-        """Whether agents have anything in common that opponents must not share."""
-        return self.critic == "shared" or self.share_parameters == "kind"
-
-    @property
     def critics_in_target(self) -> int:
         """Number of critics that make a target."""
         return self.target_critics or self.num_critics
