@@ -84,10 +84,10 @@ TWIN = Twin(teams=("agents", "adversaries", "agents"))
 TWIN_SETTINGS = [*SMALL[2:], "seeds=2", "normalize_observations=true"]
 
 
-def test_a_group_across_teams():
-    """Agents of both teams in one stack of networks: each team takes its own out, with its own statistics."""
+def test_teams_that_are_alike():
+    """Agents of both teams with the same sizes and algorithm: each team has its own networks and statistics."""
     run = make(TWIN_SETTINGS, TWIN)
-    assert len(run.training.layout.groups) == 1
+    assert [group.members for group in run.training.layout.groups] == [(0, 2), (1,)]
     played = meet({"twin": run}, "twin", "twin", OWN[:2], episodes=8, env=TWIN)
     found = run.training.evaluate(run.state, 8, True, SEED)
     np.testing.assert_allclose(played, found.episode_return.mean(axis=1), rtol=1e-5)
