@@ -196,6 +196,16 @@ def test_a_sweep_of_them_is_that_of_runs_alone(tmp_path):
     assert not (tmp_path / "swept" / "batches").exists() or not list((tmp_path / "swept" / "batches").iterdir())
 
 
+def test_where_all_seeds_diverge_it_ends_there(tmp_path):
+    """Before the switch: the one agent takes over where they stopped, and nobody is left to train."""
+    given = ["algo.lr=1e30", "on_divergence=stop_seed", "eval_every=0", "total_steps=900", "env=simple_spread"]
+    assert train.main([*TINY[5:], "algo=hybrid", "algo.hidden=[4]", *given, f"out={tmp_path}", "name=run"]) == 3
+    steps = [int(row["step"]) for row in rows(tmp_path / "run")]
+    assert steps == sorted(steps) and steps[-1] < 500 and len(steps) == len(rows(tmp_path / "run" / "agents")) + 2
+    last = int(checkpoint.verify(tmp_path / "run" / "checkpoints").name)
+    assert last == steps[-1] and len(set(steps)) == len(steps) // 2
+
+
 def test_without_a_directory():
     result = train_here("algo.hidden=[4]", algo="hybrid", seeds=1, num_envs=2, total_steps=400, learning_starts=100,
                         batch_size=16, log_every=100, eval_every=0)  # fmt: skip

@@ -185,7 +185,8 @@ class Recorder:
             return Recorded(directory, part_of, outcome)
         del outcome  # its replay
         saved = hybrid.last_checkpoint(directory, self.processes)
-        state, done = hybrid.begin(training, part_of, saved), part_of.total_steps
+        state = hybrid.begin(training, part_of, saved)
+        done = training.step(state)  # earlier than the switch where all seeds have diverged and stopped
         if self.processes.first:
             hybrid.write_table(training, part_of, directory)
         self.say(f"one agent takes over at env step {done:,}")
