@@ -236,8 +236,12 @@ def restore_replay(
     rollouts: int,
     convert: Callable[[np.ndarray], np.ndarray] = lambda rows: rows,
 ) -> jax.Array:
-    """The replay in the checkpoint at `path`, of so many rollouts, one seed at a time; convert: what its rows [rows,
-    row size] become. Raises UserError where it does not fit the trainer."""
+    """The replay in the checkpoint at `path`, after `rollouts` rollouts, one seed at a time. Raises UserError where it
+    does not fit the trainer.
+
+    Args:
+        convert: what its rows [rows, row size] become.
+    """
     filled, local = trainer.schedule.filled_rows(rollouts), []
     with ocp.StandardCheckpointer() as checkpointer:
         for device, seeds in trainer.sharding.device_seeds():

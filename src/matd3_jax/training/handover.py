@@ -21,7 +21,7 @@ from matd3_jax.errors import UserError
 
 
 def widened(algorithm: Algorithm, agents: int) -> Algorithm:
-    """Give the algorithm of one agent in the place of so many the room for their networks side by side."""
+    """Give the algorithm of one agent in the place of several the room for their networks side by side."""
     return dataclasses.replace(algorithm, hidden=tuple(agents * width for width in algorithm.hidden))
 
 
@@ -58,13 +58,13 @@ class Team(NamedTuple):
             )
         return cls(name, agents, entries)
 
-    def check_widths(self, source: str, there: tuple[int, ...], here: tuple[int, ...]) -> None:
-        """Raise UserError unless the hidden layers `here` hold those of all agents."""
-        wanted = tuple(len(self.agents) * width for width in there)
-        if wanted != here:
+    def check_widths(self, source: str, there: Algorithm, here: Algorithm) -> None:
+        """Raise UserError unless the hidden layers of the one agent `here` hold those of all agents."""
+        wanted = widened(there, len(self.agents)).hidden
+        if wanted != here.hidden:
             raise UserError(
-                f"{source}: the networks of {len(self.agents)} agents with hidden={_list(there)} stand side by side in "
-                f"those of one agent with hidden={_list(wanted)}, not {_list(here)}"
+                f"{source}: the networks of {len(self.agents)} agents with hidden={_list(there.hidden)} stand side by "
+                f"side in those of one agent with hidden={_list(wanted)}, not {_list(here.hidden)}"
             )
 
 
@@ -73,12 +73,7 @@ def actor(team: Team, each: Sequence[Params], size: int, fill: bool = False) -> 
 
     Leaves: leading axis [seeds]. fill: as for `_blocks`.
     """
-    joined = {}
-    for layer in range(_layers(each[0])):
-        kernels = [one[f"kernel_{layer}"] for one in each]
-        joined[f"kernel_{layer}"] = _blocks(kernels, fill) if layer else _first(kernels, team.entries, size, fill)
-        joined[f"bias_{layer}"] = np.concatenate([one[f"bias_{layer}"] for one in each], axis=-1)
-    return joined
+    return _side_by_side(each, team.entries, size, fill, _layers(each[0]))
 
 
 def critic(each: Sequence[Params], columns: Sequence[Sequence[int]], size: int, fill: bool = False) -> Params:
@@ -91,16 +86,12 @@ def critic(each: Sequence[Params], columns: Sequence[Sequence[int]], size: int, 
         size: of the one agent's inputs.
         fill: as for `_blocks`.
     """
-    joined = {}
-    last = _layers(each[0]) - 1
-    for layer in range(last):
-        kernels = [one[f"kernel_{layer}"] for one in each]
-        joined[f"kernel_{layer}"] = _blocks(kernels, fill) if layer else _first(kernels, columns, size, fill)
-        joined[f"bias_{layer}"] = np.concatenate([one[f"bias_{layer}"] for one in each], axis=-1)
-    share = np.float32(1 / len(each))
-    joined[f"kernel_{last}"] = share * np.concatenate([one[f"kernel_{last}"] for one in each], axis=-2)
-    joined[f"bias_{last}"] = share * np.sum([one[f"bias_{last}"] for one in each], axis=0)
-    return joined
+    last, share = _layers(each[0]) - 1, np.float32(1 / len(each))
+    return {
+        **_side_by_side(each, columns, size, fill, last),
+        f"kernel_{last}": share * np.concatenate([one[f"kernel_{last}"] for one in each], axis=-2),
+        f"bias_{last}": share * np.sum([one[f"bias_{last}"] for one in each], axis=0),
+    }
 
 
 def actor_moments(team: Team, each: Sequence[optax.ScaleByAdamState], size: int) -> optax.ScaleByAdamState:
@@ -185,7 +176,7 @@ def networks(
     for field, plain in (("critic_head", "scalar"), ("critic_norm", "none")):
         if getattr(wanted, field) != plain:
             raise UserError(f"{source}: critics stand side by side in those of one agent with {field}={plain} only")
-    team.check_widths(source, there.algorithms[team.agents[0]].hidden, wanted.hidden)
+    team.check_widths(source, there.algorithms[team.agents[0]], wanted)
     columns = critic_columns(source, team, there, here, one)
     size, inputs = here.observation_sizes[one], critic_input_size(here, here.groups[here.place(one)[0]])
 
@@ -232,6 +223,19 @@ def statistics(source: str, team: Team, parts: Sequence[Statistics], size: int) 
 
 def _layers(params: Params) -> int:
     return sum(name.startswith("kernel_") for name in params)
+
+
+def _side_by_side(
+    each: Sequence[Params], places: Sequence[Sequence[int]], size: int, fill: bool, layers: int
+) -> Params:
+    """The first `layers` layers of several networks as those of one with `size` inputs; places, fill: as for
+    `_first` and `_blocks`."""
+    joined = {}
+    for layer in range(layers):
+        kernels = [one[f"kernel_{layer}"] for one in each]
+        joined[f"kernel_{layer}"] = _blocks(kernels, fill) if layer else _first(kernels, places, size, fill)
+        joined[f"bias_{layer}"] = np.concatenate([one[f"bias_{layer}"] for one in each], axis=-1)
+    return joined
 
 
 def _first(kernels: Sequence[np.ndarray], places: Sequence[Sequence[int]], size: int, fill: bool) -> np.ndarray:

@@ -112,7 +112,7 @@ class Recorder:
             total_steps: env steps of each seed from now on; None: as before.
             env: of a run whose environment was given as an object.
             unpickle: of environments on the host (see `checkpoint.restore`).
-            untouched: nothing has been trained yet, and nobody is told so.
+            untouched: nothing has been trained yet; no message says that it starts again.
 
         Raises UserError where there is no run, it has come to its end, or the checkpoint is damaged.
         """
