@@ -14,7 +14,11 @@ from pathlib import Path
 
 import pytest
 
-OPTIONS = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+OPTIONS = {
+    "xla_backend_optimization_level": 0,
+    "xla_llvm_disable_expensive_passes": True,
+    "xla_cpu_parallel_codegen_split_count": 1,  # the other cores have workers of their own
+}
 """Compile three to five times faster; what is computed stays the same."""
 if importlib.metadata.version("jaxlib").startswith("0.10."):
     OPTIONS["xla_cpu_use_fusion_emitters"] = False  # other versions end the process over a flag that they do not know
@@ -42,6 +46,8 @@ if not IN_WORKER:  # workers get all of it from the process that starts them
         os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 
 import jax  # noqa: E402  (reads the environment when it is imported)
+
+gc.set_threshold(50_000)  # tracing makes so many objects that collecting them takes a twentieth of the time
 
 jax.config.update("jax_num_cpu_devices", 2)  # counts only before the first computation, hence here
 
