@@ -29,6 +29,7 @@ from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option
 from matd3_jax.core import update
 from matd3_jax.core.agents import Group
+from matd3_jax.errors import UserError
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.terminal import say
 from matd3_jax.training import memory
@@ -92,6 +93,10 @@ def products(trainer: TrainLoop, part: str = "loop") -> dict[Product, float]:
     """How many of each product one device does in one iteration: of the "rollout", the "update", or the whole
     "loop"."""
     schedule, layout = trainer.schedule, trainer.layout
+    if layout.recurrent:
+        raise UserError(
+            "actor=gru: the products of perceptrons alone are counted one by one (training.cost counts all)"
+        )
     found: dict[Product, float] = {}
     local = trainer.sharding.local_seeds
     updates = trainer.rollouts_per_iteration * schedule.updates_per_collect

@@ -174,3 +174,19 @@ def test_what_is_not_known_is_not_guessed(monkeypatch):
 )  # fmt: skip
 def test_durations(seconds, text):
     assert cost.duration(seconds) == text
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        ["sequence_length=4", "burn_in=2"],
+        ["sequence_length=4", "burn_in=0", "algo.critic=own", "algo.num_critics=1"],
+        ["sequence_length=8", "burn_in=2", "env=simple_tag", "adversary=iltd3", "algo.num_critics=3"],
+    ],
+    ids=" ".join,
+)
+def test_products_of_recurrent_networks_are_those_of_the_compiled_program(more):
+    found = training("env=simple_spread", "algo.actor=gru", "algo.gru_units=5", *more)
+    trainer = found.trainer
+    flops = cost.step_flops(found.layout, trainer.schedule) * trainer.iteration_steps * trainer.sharding.padded_seeds
+    assert limits.compiled_flops(trainer) == pytest.approx(flops, rel=1e-12)

@@ -90,6 +90,8 @@ class AlgoConfig:
     actor_output: str = setting(SHAPES, choices=("sigmoid", "tanh"), before="sigmoid")
     actor_average: float = setting(SHAPES, least=0, most=1, before=0.0)
     reward_scale: float = setting(SHAPES, above=0, before=1.0)
+    actor: str = setting(SHAPES, choices=("mlp", "gru"), before="mlp")
+    gru_units: int = setting(SHAPES, least=1, before=64)
     critic_norm: str = setting(SHAPES, choices=("none", "layer"), before="none")
     critic_head: str = setting(SHAPES, choices=("scalar", "categorical", "quantile"), before="scalar")
     critic_atoms: int = setting(SHAPES, least=2, before=51)
@@ -175,6 +177,8 @@ class Config:
     shared_minibatch: bool = setting(SHAPES)
     update_order: str = setting(SHAPES, choices=("simultaneous", "sequential", "random_sequential"))
     n_step: int = setting(SHAPES, least=1, before=1)
+    sequence_length: int = setting(SHAPES, least=1, before=16)
+    burn_in: int = setting(SHAPES, least=0, before=8)
     normalize_observations: bool = setting(SHAPES, before=False)
     normalize_least_deviation: float = setting(SHAPES, least=0, before=0.0)
     replay_capacity: int = setting(SHAPES, least=1)
@@ -203,6 +207,11 @@ class Config:
     def teams(self) -> dict[str, AlgoConfig]:
         """The algorithm of each team."""
         return {"agents": self.algo, "adversaries": self.adversary or self.algo}
+
+    @property
+    def recurrent(self) -> bool:
+        """Whether networks of a team that learns have states."""
+        return any(team.actor == "gru" and not team.frozen for team in self.teams().values())
 
     @property
     def hands_over(self) -> bool:

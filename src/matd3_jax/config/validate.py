@@ -35,6 +35,7 @@ def check(config: "Config") -> None:
         if team is not None:
             _check_team(name, team, config.updates_per_collect, need)
             _check_order(name, team, config.update_order, need)
+            _check_recurrent(name, team, config, need)
     collect = config.num_envs * config.rollout_length
     need(
         config.batch_size <= config.replay_capacity,
@@ -160,6 +161,42 @@ def _check_order(name: str, team: "AlgoConfig", order: str, need: Any) -> None:
         team.frozen or team.critic != "shared" or order != "sequential",
         f"{name}.critic=shared has one target for the whole team, and update_order=sequential one for each agent in "
         "its turn: take simultaneous or random_sequential",
+    )
+
+
+def _check_recurrent(name: str, team: "AlgoConfig", config: "Config", need: Any) -> None:
+    """What goes with recurrent networks."""
+    if team.actor != "gru":
+        return
+    key = f"{name}.actor=gru"
+    need(not team.frozen, f"{name}.policy={team.policy}: its actors are recurrent, and frozen teams play others alone")
+    need(config.n_step == 1, f"{key} has targets of one step: leave n_step={config.n_step} out")
+    need(team.share_parameters == "none", f"{key} has networks for each agent: leave {name}.share_parameters out")
+    need(team.critic != "shared", f"{key} has critics for each agent: leave {name}.critic=shared out")
+    need(
+        not team.adversarial,
+        f"{key}: {name}.adversarial_step moves actions that recurrent critics also remember; set it to 0",
+    )
+    need(not team.hands_over, f"{key}: {team.name}'s agents hand over networks with {name}.actor=mlp alone")
+    need(
+        config.update_order != "random_sequential",
+        f"{key} learns from replayed actions: leave update_order=random_sequential out",
+    )
+    need(
+        not config.diagnostics.q_bias,
+        f"diagnostics.q_bias=true begins anywhere in an episode, and critics of {key} need what came before: leave it "
+        "false",
+    )
+    need(
+        config.batch_size % config.sequence_length == 0,
+        f"batch_size={config.batch_size} is not a multiple of sequence_length={config.sequence_length}",
+    )
+    steps = config.burn_in + config.sequence_length
+    least = config.num_envs * steps
+    need(
+        config.learning_starts >= least,
+        f"learning_starts={config.learning_starts} is less than a sequence in each environment: num_envs="
+        f"{config.num_envs} x (burn_in={config.burn_in} + sequence_length={config.sequence_length}) = {least}",
     )
 
 

@@ -38,7 +38,7 @@ def update_agent(
         next_action = losses.target_actions(layout, group, hyper, mu_targets, own_target, batch, noise)
     y = losses.td_target(layout, group, hyper, state.critic_target, batch, next_action, noise.critics)
 
-    critic_gradient = jax.grad(lambda params: losses.critic_loss(group, params, batch, y), has_aux=True)
+    critic_gradient = jax.grad(lambda params: losses.critic_loss(layout, group, params, batch, y), has_aux=True)
     gradients, (loss, q_value) = mean_over(axis, critic_gradient(state.critic))
     state = step_critics(group, hyper, state, gradients)
     if not move:
@@ -101,7 +101,7 @@ def update_together(
             own = of(state.actor_target, k)
             action = losses.target_actions(layout, group, hyper, mu_targets, own, batch, noise)
         y = losses.td_target(layout, group, hyper, of(state.critic_target, k), batch, action, noise.critics)
-        return losses.critic_loss(group, of(params, k), batch, jax.lax.stop_gradient(y))
+        return losses.critic_loss(layout, group, of(params, k), batch, jax.lax.stop_gradient(y))
 
     nothing = jnp.full(len(group.members), jnp.nan)
     loss = q_value = mu_loss = nothing

@@ -8,7 +8,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from matd3_jax.core import critics, policies, sharing
+from matd3_jax.core import critics, gru, policies, sharing
 from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.core.critics import Critic
 from matd3_jax.core.networks import StackedMLP, apply
@@ -37,6 +37,23 @@ class Group:
         """The actor of one member: observations [batch, observation_size] to outputs [batch, action size]."""
         return StackedMLP((), (*self.algorithm.hidden, self.action_space.size))
 
+    def init_actor(self, key: chex.PRNGKey) -> chex.ArrayTree:
+        """Draw the actor of one member."""
+        read = self.observation_size + self.index_size
+        params = self.actor.init(key, jnp.zeros((1, read + self.state_size)))["params"]
+        if not self.recurrent:
+            return params
+        inputs = self.observation_size + self.action_space.size
+        return {**params, gru.PARAMS: gru.init(jax.random.fold_in(key, 1), (), inputs, self.state_size)}
+
+    def init_critics(self, key: chex.PRNGKey, inputs: int) -> chex.ArrayTree:
+        """Draw the critics of one member, leaves [critics, ...]; inputs: entries of what they read, states apart."""
+        params = self.critic.init(key, inputs + self.state_size)
+        if not self.recurrent:
+            return params
+        stack = (self.algorithm.num_critics,)
+        return {**params, gru.PARAMS: gru.init(jax.random.fold_in(key, 1), stack, inputs, self.state_size)}
+
     @property
     def actors(self) -> StackedMLP:
         """The actors of all members, stacked: [members, batch, ...]."""
@@ -46,6 +63,16 @@ class Group:
     def frozen(self) -> bool:
         """Whether the members play a given policy and do not learn."""
         return self.algorithm.frozen
+
+    @property
+    def recurrent(self) -> bool:
+        """Whether the members' networks have states."""
+        return self.algorithm.recurrent
+
+    @property
+    def state_size(self) -> int:
+        """Entries of the state of one member's actor."""
+        return self.algorithm.gru_units if self.recurrent else 0
 
     @property
     def shared(self) -> bool:
@@ -102,7 +129,8 @@ class JointLayout:
 
     The joint observation x [observation_size] and the joint action [action_size] hold the agents' parts in the order
     of `agents`. A replay row is `x, actions, rewards, x', discount` with discount = 1 - terminated: [row_size] float32.
-    With n_step > 1 an entry `more` stands between rewards and x': 0 where the episode ended, either way, or 1.
+    With n_step > 1, and with recurrent networks, an entry `more` stands between rewards and x': 0 where the episode
+    ended, either way, or 1; behind it the states of recurrent actors before the transition.
     """
 
     agents: tuple[str, ...]
@@ -112,10 +140,21 @@ class JointLayout:
     algorithms: tuple[Algorithm, ...]
     """One per agent."""
     n_step: int = 1
-    """Rewards in a target before it bootstraps (see `returns`)."""
+    """Rewards in a target before it bootstraps (see `n_step`)."""
+    sequence_length: int = 1
+    """Transitions of a sequence that recurrent networks learn from."""
+    burn_in: int = 0
+    """Those before, which only bring their states up to date."""
 
     @classmethod
-    def of(cls, env: Environment, algorithms: Mapping[str, Algorithm], n_step: int = 1) -> "JointLayout":
+    def of(
+        cls,
+        env: Environment,
+        algorithms: Mapping[str, Algorithm],
+        n_step: int = 1,
+        sequence_length: int = 1,
+        burn_in: int = 0,
+    ) -> "JointLayout":
         """The joint layout of `env` with the algorithm of each team given by name."""
         return cls(
             agents=env.agents,
@@ -124,6 +163,8 @@ class JointLayout:
             action_spaces=env.action_spaces,
             algorithms=tuple(algorithms[team] for team in env.teams),
             n_step=n_step,
+            sequence_length=sequence_length,
+            burn_in=burn_in,
         )
 
     @property
@@ -157,6 +198,22 @@ class JointLayout:
     @property
     def action_size(self) -> int:
         return sum(space.size for space in self.action_spaces)
+
+    @cached_property
+    def state_sizes(self) -> tuple[int, ...]:
+        """Entries of the state of each agent's actor."""
+        groups = (self.groups[self.place(i)[0]] for i in range(self.num_agents))
+        return tuple(group.state_size for group in groups)
+
+    @property
+    def state_size(self) -> int:
+        """Of all agents together; 0 where nobody is recurrent."""
+        return sum(self.state_sizes)
+
+    @property
+    def recurrent(self) -> bool:
+        """Whether any networks have states: updates take sequences."""
+        return self.state_size > 0
 
     @cached_property
     def observation_starts(self) -> tuple[int, ...]:
@@ -221,7 +278,8 @@ class JointLayout:
 
     @property
     def row_size(self) -> int:
-        return 2 * self.observation_size + self.action_size + self.num_agents + 1 + (self.n_step > 1)
+        more = int(self.n_step > 1 or self.recurrent)
+        return 2 * self.observation_size + self.action_size + self.num_agents + 1 + more + self.state_size
 
     def pack_rows(
         self,
@@ -231,10 +289,13 @@ class JointLayout:
         next_x: chex.Array,
         terminated: chex.Array,
         truncated: chex.Array,
+        state: chex.Array | None = None,
     ) -> chex.Array:
         """Replay rows [..., row_size] of x, next_x [..., observation_size], action [..., action_size],
-        reward [..., num_agents], terminated and truncated [...]."""
-        more = [1.0 - (terminated | truncated).astype(jnp.float32)[..., None]] if self.n_step > 1 else []
+        reward [..., num_agents], terminated and truncated [...], state [..., state_size]."""
+        more = [] if state is None else [state]
+        if self.n_step > 1 or self.recurrent:
+            more.insert(0, 1.0 - (terminated | truncated).astype(jnp.float32)[..., None])
         discount = 1.0 - terminated.astype(jnp.float32)[..., None]
         return jnp.concatenate([x, action, reward, *more, next_x, discount], axis=-1, dtype=jnp.float32)
 
@@ -253,9 +314,10 @@ class JointLayout:
             x=rows[..., x],
             action=rows[..., self.observation_size : joint],
             reward=rows[..., joint:end],
-            more=rows[..., end] if self.n_step > 1 else None,
+            more=rows[..., end] if self.n_step > 1 or self.recurrent else None,
             next_x=rows[..., next_x],
             discount=rows[..., -1],
+            state=rows[..., end + 1 : end + 1 + self.state_size] if self.recurrent else None,
         )
 
     # ---- joint vectors -----------------------------------------------------------------------------------------------
@@ -270,8 +332,13 @@ class JointLayout:
         start = self.action_starts[agent]
         return action[..., start : start + self.action_spaces[agent].size]
 
+    def state_part(self, state: chex.Array, agent: int) -> chex.Array:
+        """What an agent's actor has [..., units] of the states of all, [..., state_size]."""
+        start = sum(self.state_sizes[:agent])
+        return state[..., start : start + self.state_sizes[agent]]
+
     def join_actions(self, parts: Sequence[chex.Array]) -> chex.Array:
-        """Joint actions [..., action_size] from one array [members, ..., size] per group."""
+        """Joint actions [..., action_size] (or states) from one array [members, ..., size] per group."""
         by_group = zip(self.groups, parts, strict=True)
         by_agent = {i: part[k] for group, part in by_group for k, i in enumerate(group.members)}
         return jnp.concatenate([by_agent[i] for i in range(self.num_agents)], axis=-1)
@@ -289,9 +356,11 @@ class RowParts:
     reward: chex.Array
     more: chex.Array | None
     """Whether the episode continues; in rows that `n_step.draw` gives, how many steps of a return follow the first.
-    None with n_step = 1."""
+    None with n_step = 1, unless networks are recurrent."""
     next_x: chex.Array
     discount: chex.Array
+    state: chex.Array | None = None
+    """[..., state_size] of recurrent actors, before the transition."""
 
 
 def _starts(sizes: Sequence[int]) -> tuple[int, ...]:

@@ -25,6 +25,10 @@ class Algorithm:
     """Number of critics that make a target, drawn at random for every agent and update (REDQ); None: all do."""
     actor_critics: Literal["first", "all"] = "first"
     """The actor climbs the first critic's value, or the mean of all critics' (REDQ, TQC)."""
+    actor: Literal["mlp", "gru"] = "mlp"
+    """"gru": actors and critics have states that sum up what came before in the episode (see `gru`)."""
+    gru_units: int = 64
+    """Size of these states."""
     critic_norm: Literal["none", "layer"] = "none"
     """"layer": layer normalization before each ReLU of the critics."""
     critic_head: Literal["scalar", "categorical", "quantile"] = "scalar"
@@ -64,6 +68,11 @@ class Algorithm:
     """The team plays a given policy, deterministically, and does not learn: it has no critics and no targets."""
     sync_targets: bool = True
     """Targets start as copies of the online networks; False: as independent draws, as in the authors' program."""
+
+    @property
+    def recurrent(self) -> bool:
+        """Whether actors and critics have states."""
+        return self.actor == "gru"
 
     @property
     def central(self) -> bool:

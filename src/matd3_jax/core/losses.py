@@ -13,6 +13,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from matd3_jax.core import gru
 from matd3_jax.core.agents import Group, JointLayout
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.minibatch import Minibatch, Noise
@@ -43,6 +44,9 @@ def td_target(
     critic = group.target_critic
     if chosen is not None:
         critic_target = jax.tree.map(lambda leaf: leaf[chosen], critic_target)
+    if batch.critic_history is not None:
+        _, after = gru.states(critic_target[gru.PARAMS], batch.critic_history, layout.burn_in)
+        next_inputs = gru.beside(next_inputs, after)
     if group.algorithm.adversarial:
         least = partial(critic.target_value, critic_target)
         next_inputs = worst_case(layout, hyper, least, next_inputs, batch.action_column)
@@ -70,7 +74,9 @@ def target_actions(
         if other.frozen:
             parts.append(batch.frozen_next[j])
             continue
-        seen = batch.next_observations[j]
+        seen, history = batch.next_observations[j], batch.histories[j] if batch.histories else None
+        if history is not None:
+            seen = gru.beside(seen, gru.states(params[gru.PARAMS], history, layout.burn_in)[1])
         output = other.outputs(params, seen) if central else apply(group.actor, params, seen)
         part = other.policy.sample(output, noise.target[j])
         draw = noise.smoothing[j]
@@ -81,11 +87,11 @@ def target_actions(
 
 
 def critic_loss(
-    group: Group, params: chex.ArrayTree, batch: Minibatch, target: chex.Array
+    layout: JointLayout, group: Group, params: chex.ArrayTree, batch: Minibatch, target: chex.Array
 ) -> tuple[chex.Array, tuple[chex.Array, chex.Array]]:
     """sum_j mean (Q_ij(x, a_1, ..., a_N) - y_i)^2, or what another head has in its place; also (its mean over the
     critics j, mean Q_i1)."""
-    loss, value = group.critic.loss(params, batch.inputs, target)
+    loss, value = group.critic.loss(params, critic_inputs(layout, params, batch), target)
     return loss.sum(), (loss.mean(), value.mean())
 
 
@@ -101,9 +107,14 @@ def actor_loss(
     """-mean Q_i1(x, a_1, ..., mu_i(o_i), ..., a_N) + regularizer * mean mu_i's output^2, the others' actions from the
     replay, adversarial: moved against Q_i1 there; twice, as value and as metric. Q_i1: or the mean over the critics
     (`actor_critics`)."""
-    output = apply(group.actor, params, batch.observation)
+    seen = batch.observation
+    if batch.history is not None:
+        seen = gru.beside(seen, gru.states(params[gru.PARAMS], batch.history, layout.burn_in)[0])
+    output = apply(group.actor, params, seen)
     action = group.policy.sample(output, noise.action)
-    inputs, change = batch.inputs, action - batch.action
+    if batch.critic_history is not None:  # states of those critics alone
+        critic = jax.tree.map(lambda leaf: leaf[: group.algorithm.critics_climbed], critic)
+    inputs, change = critic_inputs(layout, critic, batch), action - batch.action
     if group.algorithm.adversarial:
 
         def climbed(inputs: chex.Array) -> chex.Array:
@@ -113,6 +124,15 @@ def actor_loss(
     q = group.critic.value(critic, inputs, change, batch.action_column)
     loss = -q.mean() + hyper.logit_regularizer * jnp.mean(jnp.square(output))
     return loss, loss
+
+
+def critic_inputs(layout: JointLayout, params: chex.ArrayTree, batch: Minibatch) -> chex.Array:
+    """What critics with these parameters read of a minibatch: [batch, inputs], or [critics, batch, inputs] where each
+    has states of its own."""
+    if batch.critic_history is None:
+        return batch.inputs
+    before, _ = gru.states(params[gru.PARAMS], batch.critic_history, layout.burn_in)
+    return gru.beside(batch.inputs, before)
 
 
 def worst_case(

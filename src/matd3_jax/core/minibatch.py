@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from matd3_jax.core.agents import Group, JointLayout
+from matd3_jax.core.agents import Group, JointLayout, RowParts
+from matd3_jax.core.gru import History
 from matd3_jax.core.policies import Policy, flat_draw
 
 
@@ -47,6 +48,13 @@ class Minibatch(NamedTuple):
     frozen_next: tuple[chex.Array | None, ...] = ()
     """What frozen groups do in x', [members, batch, action size] each, None for groups that learn; () where none is
     frozen."""
+    history: History | None = None
+    """Of a recurrent agent's own observations and actions, no axes of a stack."""
+    histories: tuple[History | None, ...] = ()
+    """The same of those whose target actors the target needs, [agents] per group of `next_observations` with central
+    critics; None for groups without states."""
+    critic_history: History | None = None
+    """What a recurrent agent's critics remember: x and a, or o_i and a_i."""
 
 
 class Noise(NamedTuple):
@@ -75,8 +83,13 @@ def minibatch(
     place: Place,
     gamma: chex.Array | float,
     frozen_next: tuple[chex.Array | None, ...] = (),
+    sequences: chex.Array | None = None,
 ) -> Minibatch:
-    """The minibatch of one member from its rows [batch, row_size]; frozen_next: see there."""
+    """The minibatch of one member from its rows [batch, row_size]; frozen_next: see there.
+
+    sequences: [sequences, steps, row_size] whose steps after the first `burn_in` are the rows, where anybody is
+        recurrent.
+    """
     central = group.algorithm.central
     parts = layout.row_parts(rows)
 
@@ -90,17 +103,49 @@ def minibatch(
         None if other.frozen else jnp.stack([layout.observation_part(parts.next_x, j) for j in other.members])
         for other in layout.groups
     )
-    return Minibatch(
+    whole = Minibatch(
         observation=observation,
         action=action,
         inputs=parts.inputs if central else jnp.concatenate([observation, action], axis=-1),
         reward=part(layout.team_mean(parts.reward), place.agent, 1)[..., 0],
-        discount=parts.discount if parts.more is None else parts.discount * gamma**parts.more,
+        discount=parts.discount if layout.n_step == 1 else parts.discount * gamma**parts.more,
         next_observations=every_next if central else (own_next,),
         next_x=parts.next_x if central else own_next,
         action_column=layout.observation_size + place.action if central else group.observation_size,
         frozen_next=frozen_next if central else (),
     )
+    return whole if sequences is None else _with_histories(layout, group, whole, layout.row_parts(sequences), place)
+
+
+def _with_histories(layout: JointLayout, group: Group, batch: Minibatch, parts: RowParts, place: Place) -> Minibatch:
+    """The minibatch of one member with what recurrent networks take of its sequences [sequences, steps]."""
+    assert parts.more is not None and parts.state is not None
+    more = parts.more
+
+    def cut(whole: chex.Array, start: chex.Array, size: int) -> chex.Array:
+        return jax.lax.dynamic_slice_in_dim(whole, start, size, axis=-1)
+
+    def of(other: Group) -> History | None:
+        if not other.recurrent:
+            return None
+        inputs, start = [], []
+        for j in other.members:
+            seen, done = layout.observation_part(parts.x, j), layout.action_part(parts.action, j)
+            inputs.append(jnp.concatenate([seen, done], axis=-1))
+            start.append(layout.state_part(parts.state[:, 0], j))
+        return History(jnp.stack(inputs), more, jnp.stack(start))
+
+    own = None
+    if group.recurrent:
+        observation = cut(parts.x, place.observation, group.observation_size)
+        action = cut(parts.action, place.action, group.action_space.size)
+        starts = np.cumsum([0, *layout.state_sizes[:-1]])
+        start = cut(parts.state[:, 0], jnp.asarray(starts)[place.agent], group.state_size)
+        own = History(jnp.concatenate([observation, action], axis=-1), more, start)
+    central = group.algorithm.central
+    critic = None if own is None else History(parts.inputs if central else own.inputs, more)
+    everybody = tuple(of(other) for other in layout.groups) if central else (own,)
+    return batch._replace(history=own, histories=everybody, critic_history=critic)
 
 
 def draw_noise(layout: JointLayout, group: Group, shape: tuple[int, int], key: chex.PRNGKey, axis: str | None) -> Noise:

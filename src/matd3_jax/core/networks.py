@@ -39,10 +39,10 @@ class StackedMLP(nn.Module):
         for layer, width in enumerate(self.features):
             kernel = self.param(f"kernel_{layer}", glorot, (*self.stack, inputs, width))
             bias = self.param(f"bias_{layer}", nn.initializers.zeros, (*self.stack, width))
-            y = _product(x, kernel)
+            y = product(x, kernel)
             if layer == 0 and correction is not None:
                 k = correction.shape[-1]
-                y = y + _product(correction, jax.lax.dynamic_slice_in_dim(kernel, column, k, axis=-2))
+                y = y + product(correction, jax.lax.dynamic_slice_in_dim(kernel, column, k, axis=-2))
             y = y + bias[..., None, :]
             if layer == len(self.features) - 1:
                 return y
@@ -100,7 +100,7 @@ def _matmul_backward(kept, slope):
 _matmul.defvjp(_matmul_forward, _matmul_backward, symbolic_zeros=True)
 
 
-def _product(x: chex.Array, kernel: chex.Array) -> chex.Array:
+def product(x: chex.Array, kernel: chex.Array) -> chex.Array:
     """x [*leading, batch, i] times kernel [*leading, *rest, i, j]: [*leading, *rest, batch, j], as one product of
     width rest x j for each of `leading`."""
     leading = x.ndim - 2

@@ -48,13 +48,28 @@ def successors(written: Written, indices: chex.Array, stride: int, steps: int) -
         stride: rows from one of an environment to its next: a rollout's rows are time-major [length, num_envs], and
             the next rollout follows.
     """
-    capacity, n, count = written
-    size = filled(capacity, n, count)
-    # Modulo before the product, which overflows otherwise.
-    oldest = jnp.where(count < capacity // n, 0, count % (capacity // n) * n)
+    capacity, size = written.capacity, filled(*written)
+    first = oldest(written)
     offsets = stride * jnp.arange(steps)
-    there = ((indices - oldest) % capacity)[..., None] + offsets < size
+    there = ((indices - first) % capacity)[..., None] + offsets < size
     return (indices[..., None] + offsets) % capacity, there
+
+
+def oldest(written: Written) -> chex.Array:
+    """Row number of the oldest row."""
+    capacity, n, count = written
+    # Modulo before the product, which overflows otherwise.
+    return jnp.where(count < capacity // n, 0, count % (capacity // n) * n)
+
+
+def following(written: Written, ages: chex.Array, stride: int, steps: int) -> chex.Array:
+    """Row numbers int32 [*ages.shape, steps] of rows and those after them in their environments.
+
+    Args:
+        ages: places of the first rows, counted from the oldest row; so that all that follow are there.
+        stride: as in `successors`.
+    """
+    return (oldest(written) + ages[..., None] + stride * jnp.arange(steps)) % written.capacity
 
 
 def sample_indices(key: chex.PRNGKey, size: chex.Array, shape: tuple[int, ...]) -> chex.Array:

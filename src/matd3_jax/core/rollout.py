@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from matd3_jax.core import frozen, running_statistics
-from matd3_jax.core.agents import JointLayout
+from matd3_jax.core import frozen, gru, running_statistics
+from matd3_jax.core.agents import Group, JointLayout
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.frozen import Scale
 from matd3_jax.core.running_statistics import Statistics
@@ -44,6 +44,8 @@ class EnvState(NamedTuple):
     noise_quantile: chex.Array | None = None
     """[num_envs, num_agents] uniform on [0, 1): where in its range each agent's exploration noise is in the running
     episode. None where no agent has a range (see `ranged`)."""
+    recurrent: chex.Array | None = None
+    """[num_envs, state_size] states of the actors. None where there are none (`JointLayout.state_size`)."""
 
 
 class Episodes(NamedTuple):
@@ -66,12 +68,16 @@ class Evaluation(NamedTuple):
     """[episodes, measures] of the environment (`Environment.measures`), means over the env steps of the episode."""
 
 
-def start(env: Environment, key: chex.PRNGKey, num_envs: int, noise_range: bool = False) -> EnvState:
-    """Fresh episodes in `num_envs` environments; `noise_range`: with noise quantiles."""
+def start(
+    env: Environment, key: chex.PRNGKey, num_envs: int, noise_range: bool = False, state_size: int = 0
+) -> EnvState:
+    """Fresh episodes in `num_envs` environments; `noise_range`: with noise quantiles; `state_size`: with states of the
+    actors."""
     state, observation = jax.vmap(env.reset)(jax.random.split(key, num_envs))
     shape = (num_envs, len(env.agents))
     quantile = jax.random.uniform(jax.random.fold_in(key, APART), shape) if noise_range else None
-    return EnvState(state, observation, jnp.zeros(shape), jnp.zeros(num_envs, jnp.int32), quantile)
+    recurrent = jnp.zeros((num_envs, state_size)) if state_size else None
+    return EnvState(state, observation, jnp.zeros(shape), jnp.zeros(num_envs, jnp.int32), quantile, recurrent)
 
 
 def ranged(layout: JointLayout) -> bool:
@@ -108,13 +114,14 @@ def collect(
         draws, step_keys, fresh, fresh_quantile = inputs
         before = carry.state if keep_states else None
         quantile = 0.5 if carry.noise_quantile is None else carry.noise_quantile
-        action = act(layout, policy, carry.observation, draws, quantile, random)
+        action = act(layout, policy, carry.observation, draws, quantile, random, carry.recurrent)
+        recurrent = remember(layout, policy, carry.observation, action, carry.recurrent)
         if on_demand:
             after, *fresh = jax.vmap(env.step_or_reset)(step_keys, fresh, carry.state, env_actions(layout, action))
         else:
             after = jax.vmap(env.step)(step_keys, carry.state, env_actions(layout, action))
         x, next_x = (jnp.concatenate(o, axis=-1) for o in (carry.observation, after.observation))
-        rows = layout.pack_rows(x, action, after.reward, next_x, after.terminated, after.truncated)
+        rows = layout.pack_rows(x, action, after.reward, next_x, after.terminated, after.truncated, carry.recurrent)
         returns = carry.episode_return + after.reward
         steps = carry.episode_step + 1
         ended = after.terminated | after.truncated
@@ -127,7 +134,9 @@ def collect(
             (after.state, after.observation, carry.noise_quantile),
         )
         returns, steps = jnp.where(ended[:, None], 0, returns), jnp.where(ended, 0, steps)
-        carry = EnvState(state, observation, returns, steps, quantile)
+        if recurrent is not None:
+            recurrent = jnp.where(ended[:, None], 0, recurrent)
+        carry = EnvState(state, observation, returns, steps, quantile, recurrent)
         return carry, (rows, episodes, before)
 
     step_keys, reset_keys = (jax.random.split(k, (length, num_envs)) for k in (step_key, reset_key))
@@ -158,17 +167,19 @@ def evaluate(
     act as they do while collecting.
     """
 
-    def choose(key, state, observation):
-        return decide(layout, policy, observation, None if deterministic else key)
+    def choose(key, state, observation, recurrent):
+        return decide(layout, policy, observation, None if deterministic else key, recurrent)
 
-    return play(env, choose, key, episodes)
+    return play(env, choose, key, episodes, fresh_state(layout, episodes))
 
 
-def play(env: Environment, choose: Callable, key: chex.PRNGKey, episodes: int) -> Evaluation:
+def play(env: Environment, choose: Callable, key: chex.PRNGKey, episodes: int, recurrent: Any = None) -> Evaluation:
     """Play `episodes` whole episodes side by side; stops as soon as all have ended.
 
-    choose: (key, states, observations) -> actions, as `Environment.reset` gives and `Environment.step` takes them but
-        with a leading axis [episodes].
+    Args:
+        choose: (key, states, observations, states of the actors) -> (actions, states of the actors), as
+            `Environment.reset` gives and `Environment.step` takes them but with a leading axis [episodes].
+        recurrent: the states of the actors at the start.
     """
     state_key, step_key = jax.random.split(key)
     step_keys = jax.random.split(step_key, env.episode_length)
@@ -181,7 +192,7 @@ def play(env: Environment, choose: Callable, key: chex.PRNGKey, episodes: int) -
     def step(carry):
         t, env_state, measured, running = carry
         act_key, env_key = jax.random.split(step_keys[t])
-        actions = choose(act_key, env_state.state, env_state.observation)
+        actions, recurrent = choose(act_key, env_state.state, env_state.observation, env_state.recurrent)
         after = jax.vmap(env.step)(jax.random.split(env_key, episodes), env_state.state, actions)
         measured += jnp.where(running[:, None], jax.vmap(env.measure)(after.state), 0)
         env_state = EnvState(
@@ -189,21 +200,38 @@ def play(env: Environment, choose: Callable, key: chex.PRNGKey, episodes: int) -
             after.observation,
             env_state.episode_return + jnp.where(running[:, None], after.reward, 0),
             env_state.episode_step + running,
+            recurrent=recurrent,
         )
         return t + 1, env_state, measured, running & ~(after.terminated | after.truncated)
 
+    env_state = env_state._replace(recurrent=recurrent)
     carry = (jnp.int32(0), env_state, jnp.zeros((episodes, len(env.measures))), jnp.ones(episodes, bool))
     _, env_state, measured, _ = jax.lax.while_loop(going, step, carry)
     return Evaluation(env_state.episode_return, env_state.episode_step, measured / env_state.episode_step[:, None])
 
 
 def decide(
-    layout: JointLayout, policy: PolicyParams, observation: Sequence[chex.Array], key: chex.PRNGKey | None
-) -> tuple[chex.Array, ...]:
+    layout: JointLayout,
+    policy: PolicyParams,
+    observation: Sequence[chex.Array],
+    key: chex.PRNGKey | None,
+    recurrent: chex.Array | None = None,
+) -> tuple[tuple[chex.Array, ...], chex.Array | None]:
     """What each agent does, as `Environment.step` takes it with a leading axis [envs], for one observation
-    [envs, size] per agent. key: of the noise; None: deterministic actions."""
+    [envs, size] per agent; and the states of the actors [envs, state_size] after it, where there are any.
+
+    Args:
+        key: of the noise; None: deterministic actions.
+        recurrent: the states before.
+    """
     draws = None if key is None else _noise(layout, key, observation[0].shape[:1])
-    return env_actions(layout, act(layout, policy, observation, draws))
+    action = act(layout, policy, observation, draws, recurrent=recurrent)
+    return env_actions(layout, action), remember(layout, policy, observation, action, recurrent)
+
+
+def fresh_state(layout: JointLayout, envs: int) -> chex.Array | None:
+    """States of the actors [envs, state_size] at the start of episodes; None where there are none."""
+    return jnp.zeros((envs, layout.state_size)) if layout.recurrent else None
 
 
 def act(
@@ -213,6 +241,7 @@ def act(
     draws: Sequence[chex.Array | None] | None,
     noise_quantile: chex.Array | float = 0.5,
     random: bool = False,
+    recurrent: chex.Array | None = None,
 ) -> chex.Array:
     """Joint actions [envs, action_size] for one observation [envs, size] per agent.
 
@@ -222,10 +251,9 @@ def act(
         noise_quantile: [envs, num_agents] where in its range the exploration noise of an agent that has one is;
             outside of collecting the middle.
         random: the draws are whole actions.
+        recurrent: states of the actors [envs, state_size], where there are any.
     """
-    parts, statistics, raw = [], policy.statistics, observation
-    if statistics is not None:
-        observation = [running_statistics.normalize_part(layout, statistics, o, i) for i, o in enumerate(observation)]
+    parts, raw, observation = [], observation, _normalized(layout, policy, observation)
     for g, group in enumerate(layout.groups):
         if group.frozen:
             seen = jnp.stack([raw[i] for i in group.members])
@@ -238,6 +266,8 @@ def act(
             parts.append(draws[g])
             continue
         stacked = jnp.stack([observation[i] for i in group.members])
+        if group.recurrent:
+            stacked = jnp.concatenate([stacked, _states(layout, group, recurrent)], axis=-1)
         output = group.outputs(policy.actors[g], stacked)
         draw = None if draws is None else draws[g]
         sigma = policy.hyper[g].exploration_noise
@@ -247,6 +277,41 @@ def act(
             sigma = sigma + own * (policy.hyper[g].exploration_noise_high - sigma)
         parts.append(group.policy.sample(output, draw, sigma))
     return layout.join_actions(parts)
+
+
+def remember(
+    layout: JointLayout,
+    policy: PolicyParams,
+    observation: Sequence[chex.Array],
+    action: chex.Array,
+    recurrent: chex.Array | None,
+) -> chex.Array | None:
+    """The states of the actors [envs, state_size] after these observations, one [envs, size] per agent, and joint
+    actions [envs, action_size]; None where there are none."""
+    if recurrent is None:
+        return None
+    observation, parts = _normalized(layout, policy, observation), []
+    for group, params in zip(layout.groups, policy.actors, strict=True):
+        if not group.recurrent:
+            parts.append(jnp.zeros((len(group.members), *recurrent.shape[:-1], 0)))
+            continue
+        seen = [jnp.concatenate([observation[i], layout.action_part(action, i)], axis=-1) for i in group.members]
+        parts.append(gru.step(params[gru.PARAMS], _states(layout, group, recurrent), jnp.stack(seen)))
+    return layout.join_actions(parts)
+
+
+def _states(layout: JointLayout, group: Group, recurrent: chex.Array | None) -> chex.Array:
+    """Those of a group's actors, [members, envs, units]."""
+    assert recurrent is not None
+    return jnp.stack([layout.state_part(recurrent, i) for i in group.members])
+
+
+def _normalized(layout: JointLayout, policy: PolicyParams, observation: Sequence[chex.Array]) -> Sequence[chex.Array]:
+    """Observations, one [envs, size] per agent, as networks see them."""
+    statistics = policy.statistics
+    if statistics is None:
+        return observation
+    return [running_statistics.normalize_part(layout, statistics, o, i) for i, o in enumerate(observation)]
 
 
 def env_actions(layout: JointLayout, action: chex.Array) -> tuple[chex.Array, ...]:

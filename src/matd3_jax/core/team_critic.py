@@ -51,7 +51,7 @@ def update(
     own = state._replace(**{part: jax.tree.map(lambda leaf: leaf[0], getattr(state, part)) for part in PARTS})
     next_action = losses.target_actions(layout, group, hyper, mu_targets, None, batch, noise)
     y = losses.td_target(layout, group, hyper, own.critic_target, batch, next_action, noise.critics)
-    gradient = jax.grad(lambda params: losses.critic_loss(group, params, batch, y), has_aux=True)
+    gradient = jax.grad(lambda params: losses.critic_loss(layout, group, params, batch, y), has_aux=True)
     gradients, (loss, q_value) = mean_over(axis, gradient(own.critic))
     own = step_critics(group, hyper, own, gradients)
     if move:

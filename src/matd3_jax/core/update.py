@@ -59,19 +59,17 @@ def init(layout: JointLayout, key: chex.PRNGKey) -> tuple[GroupState, ...]:
 
     def one(group: Group, key: chex.PRNGKey) -> GroupState:
         algorithm, keys = group.algorithm, jax.random.split(key, 4)
-        observation = jnp.zeros((1, group.observation_size + group.index_size))
         inputs = critic_input_size(layout, group) + (0 if group.team_critic else group.index_size)
         if group.frozen:
-            mu, nothing = group.actor.init(keys[0], observation)["params"], (None,) * 6
+            mu, nothing = group.init_actor(keys[0]), (None,) * 6
             one = jax.tree.map(lambda leaf: leaf[0], unscaled(1, group.observation_size))
             return GroupState(mu, *nothing, scale=one)  # type: ignore[arg-type]
-        mu, q = group.actor.init(keys[0], observation)["params"], group.critic.init(keys[1], inputs)
+        mu, q = group.init_actor(keys[0]), group.init_critics(keys[1], inputs)
         if algorithm.sync_targets:
             # Copies, not the same arrays: the state is donated, and one buffer can't be given away twice.
             mu_target, q_target = jax.tree.map(jnp.copy, (mu, q))
         else:
-            mu_target = group.actor.init(keys[2], observation)["params"]
-            q_target = group.critic.init(keys[3], inputs)
+            mu_target, q_target = group.init_actor(keys[2]), group.init_critics(keys[3], inputs)
         adam = optimizer.adam(algorithm.adam)
         average = jax.tree.map(jnp.copy, mu) if algorithm.actor_average else None
         return GroupState(mu, q, mu_target, q_target, adam.init(mu), adam.init(q), average)
@@ -100,6 +98,7 @@ def update(
     axis: str | None = None,
     frozen_next: tuple[chex.Array | None, ...] = (),
     random_order: bool = False,
+    sequences: chex.Array | None = None,
 ) -> tuple[tuple[GroupState, ...], UpdateMetrics]:
     """One update of every agent's critics, and of actors and targets where `move` says so.
 
@@ -118,6 +117,8 @@ def update(
         frozen_next: what frozen groups do in x' of the rows (`frozen.next_actions`).
         random_order: actors move one after another in random order, after all critics, against the others' policies as
             they are by then instead of their replayed actions (see `sequential_actors`).
+        sequences: where anybody is recurrent, the rows with the steps before them [minibatches, sequences, steps,
+            row_size]: `rows` are all steps but the first `layout.burn_in`, one sequence after another.
     """
     mu_targets = [group.actor_target for group in state]
     keys = jax.random.split(key, len(layout.groups))
@@ -136,8 +137,8 @@ def update(
             number = place.agent if own_minibatches else jnp.array(layout.minibatches)[place.agent]
             return jax.lax.dynamic_index_in_dim(whole, number, keepdims=False)
 
-        others = jax.tree.map(own, frozen_next)
-        return minibatch.minibatch(layout, layout.groups[g], own(rows), place, hyper[g].gamma, others)
+        others, remembered = jax.tree.map(own, (frozen_next, sequences))
+        return minibatch.minibatch(layout, layout.groups[g], own(rows), place, hyper[g].gamma, others, remembered)
 
     def minibatches(g: int) -> Place | Minibatch:
         """Of all members, stacked; one by one each is cut out in its turn, as all N together hold N times N parts."""

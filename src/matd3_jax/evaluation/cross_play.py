@@ -44,23 +44,33 @@ class Side:
         return _members(self.env, self.team)
 
     def act(
-        self, policy: PolicyParams, state: Any, observation: tuple[chex.Array, ...], key: chex.PRNGKey | None
-    ) -> list[chex.Array]:
-        """What the team's agents do in the environment without joining, one array [envs, ...] each.
+        self,
+        policy: PolicyParams,
+        state: Any,
+        observation: tuple[chex.Array, ...],
+        key: chex.PRNGKey | None,
+        recurrent: chex.Array | None,
+    ) -> tuple[list[chex.Array], chex.Array | None]:
+        """What the team's agents do in the environment without joining, one array [envs, ...] each; and the states of
+        their actors after it, where there are any.
 
         Args:
             policy: of one seed.
             state, observation: of that environment, everybody's; leading axis [envs].
             key: of the noise; None: deterministic actions.
+            recurrent: the states before, [envs, state_size].
         """
         if not isinstance(self.env, JointTeam):
-            return list(rollout.decide(self.layout, policy, [observation[i] for i in self.members], key))
+            actions, recurrent = rollout.decide(
+                self.layout, policy, [observation[i] for i in self.members], key, recurrent
+            )
+            return list(actions), recurrent
         (agent,) = self.members
         seen = jax.vmap(self.env.join)(state, observation)[agent]
         everybody: list = [None] * len(self.env.agents)
-        (everybody[agent],) = rollout.decide(self.layout, policy, [seen], key)
+        (everybody[agent],), recurrent = rollout.decide(self.layout, policy, [seen], key, recurrent)
         parts = jax.vmap(self.env.split)(tuple(everybody))
-        return [parts[i] for i in self.env.members]
+        return [parts[i] for i in self.env.members], recurrent
 
 
 class Team(NamedTuple):
@@ -155,15 +165,19 @@ def _program(env: Environment, sides: tuple[Side, ...], devices: tuple, episodes
     def one(policies, pair, key):
         own = [jax.tree.map(lambda leaf, k=k: leaf[k], policy) for policy, k in zip(policies, pair, strict=True)]
 
-        def choose(key, state, observation):
+        def choose(key, state, observation, recurrent):
             actions: list = [None] * len(env.agents)
+            after = []
             for t, (side, policy) in enumerate(zip(sides, own, strict=True)):
-                chosen = side.act(policy, state, observation, None if deterministic else jax.random.fold_in(key, t))
+                noise = None if deterministic else jax.random.fold_in(key, t)
+                chosen, kept = side.act(policy, state, observation, noise, recurrent[t])
+                after.append(kept)
                 for i, action in zip(_members(env, side.team), chosen, strict=True):
                     actions[i] = action
-            return tuple(actions)
+            return tuple(actions), tuple(after)
 
-        return rollout.play(env, choose, key, episodes).episode_return
+        fresh = tuple(rollout.fresh_state(side.layout, episodes) for side in sides)
+        return rollout.play(env, choose, key, episodes, fresh).episode_return
 
     each = jax.vmap(one, in_axes=(None, 0, None))
     mesh = Mesh(np.array(devices), ("pairs",))
@@ -179,6 +193,8 @@ def _acting(algorithm: Algorithm) -> Algorithm:
         actor_output=algorithm.actor_output,
         noise_range=algorithm.noise_range,
         frozen=algorithm.frozen,
+        actor=algorithm.actor,
+        gru_units=algorithm.gru_units,
     )
 
 

@@ -135,16 +135,17 @@ def _episode(training: TrainingSession, number: int, deterministic: bool, steps:
         first, observation = env.reset(jax.random.split(state_key, number + 1)[number])
 
         def step(carry, key):
-            state, observation = carry
+            state, observation, recurrent = carry
             act_key, env_key = jax.random.split(key)
-            chosen = rollout.decide(layout, policy, [o[None] for o in observation], None if deterministic else act_key)
+            seen, noise = [o[None] for o in observation], None if deterministic else act_key
+            chosen, recurrent = rollout.decide(layout, policy, seen, noise, recurrent)
             actions = tuple(a[0] for a in chosen)
             after = env.step(jax.random.split(env_key, number + 1)[number], state, actions)
             kept = (keep(after.state), after.reward, after.terminated, after.truncated)
-            return (after.state, after.observation), kept
+            return (after.state, after.observation, recurrent), kept
 
         keys = jax.random.split(step_key, env.episode_length)[:steps]
-        _, (later, *rest) = jax.lax.scan(step, (first, observation), keys)
+        _, (later, *rest) = jax.lax.scan(step, (first, observation, rollout.fresh_state(layout, 1)), keys)
         states = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), keep(first), later)
         return states, *rest
 

@@ -47,7 +47,9 @@ def wanted(training: TrainingSession, policy: PolicyParams, seen: np.ndarray) ->
     layout = training.layout
     parts = [layout.observation_part(jnp.asarray(seen), i) for i in range(layout.num_agents)]
     with jax.default_matmul_precision("highest"):
-        found = jax.jit(lambda policy: rollout.decide(layout, policy, parts, None))(jax.tree.map(jnp.asarray, policy))
+        found, _ = jax.jit(lambda policy: rollout.decide(layout, policy, parts, None))(
+            jax.tree.map(jnp.asarray, policy)
+        )
     return [np.asarray(action) for action in found]
 
 

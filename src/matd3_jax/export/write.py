@@ -52,6 +52,8 @@ def export(training: TrainingSession, saved: SavedPolicies, seed: int, format: s
         raise UserError(f"seed={seed}: the seeds of the run are {training.config.seed} to {last}")
     if not saved.finite[place]:
         raise UserError(f"seed={seed} diverged: its networks are not finite at env step {saved.steps[place]:,}")
+    if training.layout.recurrent:
+        raise UserError("export writes policies of one observation; actors of actor=gru also have states")
     if format == "onnx":
         onnx_file.check()
     check_new_directory(out, "out")

@@ -169,13 +169,13 @@ def networks(
     name, wanted = here.agents[one], here.algorithms[one]
     for agent in team.agents:
         algorithm = there.algorithms[agent]
-        for field in ("actor_output", "num_critics", "critic_head", "critic_norm"):
+        for field in ("actor", "actor_output", "num_critics", "critic_head", "critic_norm"):
             a, b = getattr(algorithm, field), getattr(wanted, field)
             if a != b:
                 raise UserError(f"{source}: {there.agents[agent]} has {field}={a} there, {name} {field}={b} here")
-    for field, plain in (("critic_head", "scalar"), ("critic_norm", "none")):
+    for field, plain in (("actor", "mlp"), ("critic_head", "scalar"), ("critic_norm", "none")):
         if getattr(wanted, field) != plain:
-            raise UserError(f"{source}: critics stand side by side in those of one agent with {field}={plain} only")
+            raise UserError(f"{source}: networks stand side by side in those of one agent with {field}={plain} only")
     team.check_widths(source, there.algorithms[team.agents[0]], wanted)
     columns = critic_columns(source, team, there, here, one)
     size, inputs = here.observation_sizes[one], critic_input_size(here, here.groups[here.place(one)[0]])

@@ -38,6 +38,11 @@ class Learner:
         """Updates after which every group's policy delay has come round."""
         return math.lcm(*(group.algorithm.policy_delay for group in self.layout.learning_groups))
 
+    @property
+    def sequence_steps(self) -> int:
+        """Env steps of what recurrent networks take at a time."""
+        return self.layout.burn_in + self.layout.sequence_length
+
     def scale(self, state: TrainState) -> Statistics | None:
         """What observations are normalized by: running statistics, with the least deviation that is set."""
         if state.statistics is None or not self.least_deviation:
@@ -49,6 +54,10 @@ class Learner:
         first of them."""
         schedule, groups = self.schedule, self.layout.groups
         size = replay.filled(schedule.replay_capacity, schedule.rollout_steps, state.rollouts)
+        places, drawn = size, schedule.batch_size
+        if self.layout.recurrent:
+            places = size - (self.sequence_steps - 1) * schedule.num_envs
+            drawn //= self.layout.sequence_length
         batches = 1 if schedule.shared_minibatch else self.layout.num_minibatches
         unrolled = math.gcd(self.period, schedule.updates_per_collect)
         axis = self.sharding.minibatch_axis
@@ -57,12 +66,16 @@ class Learner:
             states, metrics = carry, []
             for u in range(unrolled):
                 index_key, update_key = jax.random.split(keys[u])
-                indices = replay.sample_indices(index_key, size, (batches, schedule.batch_size))
+                indices = replay.sample_indices(index_key, places, (batches, drawn))
                 raw = self._drawn(state, hyper, seed, minibatch.own_part(indices, axis, dimension=-1))
+                sequences = None
+                if self.layout.recurrent:
+                    sequences = self._normalized(state, seed, raw)
+                    raw = raw[..., self.layout.burn_in :, :].reshape(batches, -1, raw.shape[-1])
                 others = frozen.next_actions(self.layout, states, raw)
                 rows = self._normalized(state, seed, raw)
                 move = [(first + u + 1) % group.algorithm.policy_delay == 0 for group in groups]
-                how = (schedule.sequential, self.sharding.on_cpu, axis, others, schedule.random_order)
+                how = (schedule.sequential, self.sharding.on_cpu, axis, others, schedule.random_order, sequences)
                 states, m = update.update(self.layout, states, hyper, rows, update_key, move, *how)
                 metrics.append(m)
             return states, jax.tree.map(lambda *m: jnp.stack(m), *metrics)
@@ -104,7 +117,8 @@ class Learner:
         self, state: TrainState, hyper: Sequence[HyperParams], seed: chex.Array | int, indices: chex.Array
     ) -> chex.Array:
         """What updates take: the rows [*indices.shape, row_size] of a local seed and its `hyper`, rewards of n_step
-        steps in them, observations normalized."""
+        steps in them, observations normalized; where anybody is recurrent sequences [*indices.shape, steps, row_size],
+        `indices` counted from the oldest row."""
         return self._normalized(state, seed, self._drawn(state, hyper, seed, indices))
 
     def _drawn(
@@ -112,9 +126,13 @@ class Learner:
     ) -> chex.Array:
         """`minibatches` before their observations are normalized."""
         schedule, layout = self.schedule, self.layout
+        written = replay.Written(schedule.replay_capacity, schedule.rollout_steps, state.rollouts)
+        if layout.recurrent:
+            return replay.gather(
+                state.replay, seed, replay.following(written, indices, schedule.num_envs, self.sequence_steps)
+            )
         if layout.n_step == 1:
             return replay.gather(state.replay, seed, indices)
-        written = replay.Written(schedule.replay_capacity, schedule.rollout_steps, state.rollouts)
         gamma = jnp.stack([jnp.asarray(hyper[layout.place(i)[0]].gamma) for i in range(layout.num_agents)])
         return n_step.draw(layout, state.replay, seed, indices, written, schedule.num_envs, gamma)
 

@@ -74,7 +74,8 @@ class TrainLoop:
                 raise ValueError("agents that share a network have no order in which they learn")
         if env.on_host:  # a seed's copies are stepped once: several devices would each step their own
             devices_per_seed = 1
-        sharding = SeedSharding(num_seeds, schedule.batch_size, devices, devices_per_seed, seeds_together)
+        shared = schedule.batch_size // layout.sequence_length  # devices share whole sequences
+        sharding = SeedSharding(num_seeds, shared, devices, devices_per_seed, seeds_together)
         self.sharding, self.mesh, self.on_cpu = sharding, sharding.mesh, sharding.on_cpu
         self.learner = Learner(layout, schedule, sharding, least_deviation, unroll)
         self.hyper = self.per_group(hyper)
@@ -138,7 +139,8 @@ class TrainLoop:
 
         def one(key):
             apart = jax.random.fold_in(key, rollout.APART)
-            return rollout.start(self.env, apart, self.schedule.num_envs, rollout.ranged(self.layout))
+            ranged = rollout.ranged(self.layout)
+            return rollout.start(self.env, apart, self.schedule.num_envs, ranged, self.layout.state_size)
 
         start = jax.jit(self.sharding.sharded(jax.vmap(one), P("seeds"), P("seeds")))
         return lambda state: start(state.key)

@@ -114,7 +114,9 @@ def playing_bytes(env: Environment, layout: JointLayout) -> int:
     what the actors compute."""
     started = jax.eval_shape(partial(rollout.start, env, num_envs=1), jax.eval_shape(jax.random.key, 0))
     widest = max(max((0, *group.algorithm.hidden)) for group in layout.groups)
-    return 3 * size(started) + 4 * (layout.observation_size + 2 * layout.action_size + 2 * widest * layout.num_agents)
+    states = 4 * layout.state_size  # before and after, and the gates
+    computed = layout.observation_size + 2 * layout.action_size + 2 * widest * layout.num_agents + states
+    return 3 * size(started) + 4 * computed
 
 
 def seed_bytes(trainer: TrainLoop) -> int:
@@ -137,9 +139,13 @@ def update_bytes(trainer: TrainLoop) -> int:
         + layout.action_size
         for group in layout.learning_groups
     )
-    rows = layout.num_minibatches * layout.row_size  # gathered for all agents at once
+    steps = (layout.burn_in + layout.sequence_length) / layout.sequence_length
+    rows = steps * layout.num_minibatches * layout.row_size  # gathered for all agents at once
+    # The gates of one agent's critics and of everybody's actors, and what their gradients need of each step.
+    gates = 12 * steps * max(g.algorithm.num_critics * g.state_size for g in layout.learning_groups)
+    gates += 12 * steps * layout.state_size
     noise = layout.num_agents * 3 * layout.action_size
-    return 4 * schedule.batch_size * (2 * rows + noise + agents * 4 * widest)
+    return int(4 * schedule.batch_size * (2 * rows + noise + agents * (4 * widest + gates)))
 
 
 def most_seeds(trainer: TrainLoop, budget: int) -> int:

@@ -88,7 +88,8 @@ class TrainingSession:
                 algorithms[team] = handover.widened(algorithms[team], base.teams.count(team))
             base = JointTeam(base, (team,), full=not teams[team].hands_over)
         self.env = base
-        self.layout = JointLayout.of(self.env, algorithms, config.n_step)
+        sequences = (config.sequence_length, config.burn_in) if config.recurrent else (1, 0)
+        self.layout = JointLayout.of(self.env, algorithms, config.n_step, *sequences)
         schedule = Schedule(
             num_envs=config.num_envs,
             rollout_length=config.rollout_length,
@@ -160,7 +161,8 @@ class TrainingSession:
             f"replay{whose}: {t.sharding.padded_seeds} seeds x {copies}{t.schedule.replay_capacity:,} transitions x "
             f"{s.row_size} numbers x 4 bytes = {t.replay_bytes / 1e9:.2f} GB "
             f"(x {s.observation_size}, actions {s.action_size}, rewards "
-            f"{s.num_agents}, {'more 1, ' if s.n_step > 1 else ''}x' {s.observation_size}, discount 1)"
+            f"{s.num_agents}, {'more 1, ' if s.n_step > 1 or s.recurrent else ''}"
+            f"{f'states {s.state_size}, ' if s.recurrent else ''}x' {s.observation_size}, discount 1)"
         )
 
     def check_memory(self, recorded: bool = False) -> None:

@@ -75,7 +75,8 @@ def initial(
 
     def one(key):
         network_key, env_key, key = jax.random.split(key, 3)
-        return update.init(layout, network_key), rollout.start(env, env_key, num_envs, rollout.ranged(layout)), key
+        networks = update.init(layout, network_key)
+        return networks, rollout.start(env, env_key, num_envs, rollout.ranged(layout), layout.state_size), key
 
     groups, envs, keys = jax.vmap(one)(keys)
     state = TrainState(groups, envs, jnp.zeros((keys.shape[0], 0, 0)), keys, jnp.int32(0))
