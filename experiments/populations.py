@@ -21,8 +21,7 @@ from experiments.estimating import Batch, Estimator
 from experiments.populations_data import METRIC, RANDOM, Data, best, compared, label, median_interval, ratios
 from experiments.study import RESULTS
 from experiments.verdict import Claim, Difference
-from matd3_jax.cli import arguments as of_commands
-from matd3_jax.cli import command, sweep
+from matd3_jax.cli import catalog, command, sweep
 from matd3_jax.cli.options import Command, option, others
 from matd3_jax.errors import UserError
 from matd3_jax.figures.style import SERIES
@@ -150,7 +149,7 @@ def _keys(options: PopulationOptions) -> set[str]:
 
 def batch(key: tuple[str, str], line: Sequence[str]) -> Batch:
     """What a sweep trains at once, for an estimate."""
-    given = of_commands.SWEEP.parse(line)
+    given = catalog.SWEEP.parse(line)
     settings = sweep.read(given.settings, given.samples, given.sample_seed)[1]
     name = label(*key)
     return Batch([dataclasses.replace(one, name=f"{name}/{member}") for member, one in settings.items()])

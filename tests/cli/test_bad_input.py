@@ -15,7 +15,7 @@ import pytest
 
 import benchmarks
 import experiments
-from matd3_jax.cli import arguments, command
+from matd3_jax.cli import catalog, command
 from matd3_jax.cli.options import Command
 from matd3_jax.config.schema import AlgoConfig, Config, DiagnosticsConfig, MlflowConfig, WandbConfig
 from matd3_jax.runs.directory import RunDirectory
@@ -94,9 +94,9 @@ def needed(one: Command, key: str) -> list[str]:
     return [f"{field.name}={bad_input.good(field.metadata['bounds'])}" for field in required]
 
 
-@pytest.mark.parametrize("name", arguments.COMMANDS)
+@pytest.mark.parametrize("name", catalog.COMMANDS)
 def test_options_of_commands(name, capsys):
-    one = arguments.COMMANDS[name]
+    one = catalog.COMMANDS[name]
     found = list(cases(one))
     wrong = [
         refused(lambda argv: command.start(name, argv), [f"{key}={text}", *needed(one, key)], key, capsys)

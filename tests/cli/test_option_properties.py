@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from properties import examples, texts
 
-from matd3_jax.cli import arguments
+from matd3_jax.cli import catalog
 from matd3_jax.errors import UserError
 
 OPTIONS = [
     (command, field.name)
-    for command in arguments.COMMANDS.values()
+    for command in catalog.COMMANDS.values()
     for field in dataclasses.fields(command.options)
     if "bounds" in field.metadata
 ]
@@ -63,7 +63,7 @@ def test_a_list_in_quotation_marks_gives_its_words_back(words):
     """Commas, brackets and blanks within a word stay in it."""
     if any(word != word.strip() for word in words):
         return
-    given = arguments.PLOT.parse(["runs=nowhere", "labels=" + ",".join(f'"{word}"' for word in words)])
+    given = catalog.PLOT.parse(["runs=nowhere", "labels=" + ",".join(f'"{word}"' for word in words)])
     assert given.labels == tuple(words)
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from matd3_jax.bounds import Bounds
-from matd3_jax.cli import arguments, command
+from matd3_jax.cli import arguments, catalog, command
 from matd3_jax.cli.options import Command, flag, option, others
 from matd3_jax.errors import UserError
 from matd3_jax.figures import learning_curves
@@ -110,15 +110,15 @@ def test_texts_and_paths_stay_as_they_are_typed(text):
 
 @pytest.mark.parametrize("text", NASTY)
 def test_our_commands_take_any_name_of_a_run(text):
-    assert arguments.EVALUATE.parse([f"run={text}"]).run == Path(text)
-    assert arguments.RENDER.parse([f"run={text}"]).run == Path(text)
-    assert arguments.TRAIN.parse([f"resume={text}"]).resume == Path(text)
-    sweep = arguments.SWEEP.parse([f"name={text}", f"out={text}", f"resume={text}"])
+    assert catalog.EVALUATE.parse([f"run={text}"]).run == Path(text)
+    assert catalog.RENDER.parse([f"run={text}"]).run == Path(text)
+    assert catalog.TRAIN.parse([f"resume={text}"]).resume == Path(text)
+    sweep = catalog.SWEEP.parse([f"name={text}", f"out={text}", f"resume={text}"])
     assert (sweep.name, sweep.out, sweep.resume) == (text, Path(text), Path(text))
-    assert arguments.PLOT.parse(["runs=a", f"title={text}"]).title == text
+    assert catalog.PLOT.parse(["runs=a", f"title={text}"]).title == text
     quoted = f'"{text}"' if '"' not in text else f"'{text}'"
     if not glob.has_magic(text):  # which names the directories that match
-        assert arguments.CROSSPLAY.parse([f"runs=a,{quoted}"]).runs[1] == Path(text.strip()).expanduser()
+        assert catalog.CROSSPLAY.parse([f"runs=a,{quoted}"]).runs[1] == Path(text.strip()).expanduser()
 
 
 @pytest.mark.parametrize(
@@ -163,10 +163,10 @@ def test_what_is_missing_is_named():
         CLOSED.parse(["where="])
 
 
-@pytest.mark.parametrize("name", arguments.COMMANDS)
+@pytest.mark.parametrize("name", catalog.COMMANDS)
 def test_what_is_missing_of_our_commands_is_said_without_its_values(name):
     """`KEY=... is missing: what it is`: not what each value means."""
-    command = arguments.COMMANDS[name]
+    command = catalog.COMMANDS[name]
     given: list[str] = []
     while True:
         try:
@@ -219,11 +219,11 @@ def test_help_has_an_aligned_line_for_each_option():
     assert "More text." in lines and lines[-1] == "  do where=here count=2"
 
 
-@pytest.mark.parametrize("name", arguments.COMMANDS)
+@pytest.mark.parametrize("name", catalog.COMMANDS)
 def test_help_of_our_commands_lists_every_option(name, capsys):
     assert command.start(name, ["--help"]) == 0
     printed = capsys.readouterr().out
-    fields = dataclasses.fields(arguments.COMMANDS[name].options)
+    fields = dataclasses.fields(catalog.COMMANDS[name].options)
     for field in fields:
         meta = field.metadata
         left = meta.get("flag") or (f"{meta['others']}KEY=" if "others" in meta else f"{field.name}=")
@@ -231,10 +231,10 @@ def test_help_of_our_commands_lists_every_option(name, capsys):
         assert meta["help"][:20] in line, line
     assert all(line.startswith("  python -m matd3_jax.") for line in printed.split("examples:\n")[1].splitlines())
     for example in printed.split("examples:\n")[1].splitlines():
-        arguments.COMMANDS[name].parse([word.replace("*", "1") for word in shlex.split(example)[3:]])
+        catalog.COMMANDS[name].parse([word.replace("*", "1") for word in shlex.split(example)[3:]])
 
 
-@pytest.mark.parametrize("name", arguments.COMMANDS)
+@pytest.mark.parametrize("name", catalog.COMMANDS)
 def test_help_needs_nothing_heavy(name):
     heavy = ("jax", "hydra", "omegaconf", "numpy", "matplotlib", "brax", "mujoco", "orbax")
     code = f"import sys; from matd3_jax.cli import command; command.start({name!r}, ['-h']); " + (
@@ -247,7 +247,7 @@ def test_help_needs_nothing_heavy(name):
 def test_choices_are_those_of_what_they_choose():
     choices = {f.name: f.metadata["bounds"].choices for f in dataclasses.fields(arguments.Plot)}
     assert choices["x"] == curves.AXES and choices["average"] == bootstrap.AVERAGES
-    assert all(suffix in arguments.PLOT.help() for suffix in learning_curves.FORMATS)
+    assert all(suffix in catalog.PLOT.help() for suffix in learning_curves.FORMATS)
 
 
 # ---- lines to copy ---------------------------------------------------------------------------------------------------

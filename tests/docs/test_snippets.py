@@ -20,8 +20,7 @@ from documents import DOCUMENTS, blocks
 from experiments import all as all_studies
 from experiments import study
 from matd3_jax import config
-from matd3_jax.cli import arguments as arguments_of_commands
-from matd3_jax.cli import sweep
+from matd3_jax.cli import catalog, sweep
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
@@ -84,7 +83,7 @@ def test_command(command):
         assert {word.split("=")[0] for word in given} <= {"minutes", "seed"}
         return
     is_study = isinstance(getattr(module, "STUDY", None), study.Study)
-    ours = arguments_of_commands.COMMANDS.get(short) if name.startswith("matd3_jax.") else None
+    ours = catalog.COMMANDS.get(short) if name.startswith("matd3_jax.") else None
     command = ours or (module.STUDY.command if is_study else module.COMMAND)
     options = command.parse(list(filter(None, (concrete(word, command) for word in given))))
     fields = dataclasses.fields(options)
@@ -112,7 +111,7 @@ def concrete(word, command):
     if key == "checkpoint" and PLACEHOLDER.fullmatch(value):
         return "checkpoint=last"
     if key == "runs":
-        return "runs=a,b" if command is arguments_of_commands.PLOT else "runs=a"
+        return "runs=a,b" if command is catalog.PLOT else "runs=a"
     if not PLACEHOLDER.fullmatch(value):
         return word
     field = {field.name: field for field in dataclasses.fields(command.options)}.get(key)

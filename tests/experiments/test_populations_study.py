@@ -105,7 +105,7 @@ def test_methods_differ_in_nothing_else():
         lines = [populations.arguments(task, method, options) for method in populations.methods(options)]
         plain = [[text for text in line if not text.startswith("pbt")] for line in lines]
         assert plain[0] == plain[1] == plain[2] == lines[0] and len(lines[2]) > len(lines[1]) > len(lines[0])
-        of = sweep.arguments.SWEEP.parse(lines[1])
+        of = sweep.catalog.SWEEP.parse(lines[1])
         chosen, settings = sweep.read(of.settings, of.samples, of.sample_seed)
         values = dict(zip(settings, chosen, strict=True))
         rules = sweep.population_rules(of, populations_data.METRIC, values, settings)

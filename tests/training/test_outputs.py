@@ -9,7 +9,7 @@ from matd3_jax import config
 from matd3_jax.errors import UserError
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.training import outputs
-from matd3_jax.training.recording import Recorder
+from matd3_jax.training.recorded_run import Listeners, RecordedRun
 
 
 class Noted:
@@ -26,9 +26,9 @@ class Noted:
 @pytest.mark.parametrize(("first", "calls"), [(True, 2), (False, 0)])
 def test_of_several_processes_the_first_logs(first, calls, tmp_path):
     noted = Noted()
-    recorder = Recorder(SimpleNamespace(first=first), say=print, loggers=[noted])
+    listeners = Listeners(SimpleNamespace(first=first), print, [noted], None)
     training = SimpleNamespace(config=config.load(["env=point_reach"]), share=SimpleNamespace(total=4))
-    with recorder._outputs(training, RunDirectory(tmp_path), SimpleNamespace(diverged={})) as out:
+    with RecordedRun(listeners, training, RunDirectory(tmp_path)).outputs() as out:
         out.log({})
     assert noted.calls == calls
 

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from matd3_jax.cli import arguments, command
+from matd3_jax.cli import catalog, command
 from matd3_jax.cli.sweep import open_sweep
 from matd3_jax.errors import UserError
 from matd3_jax.runs import lock
 from matd3_jax.runtime.terminal import say
 from matd3_jax.sweep.runner import Sweep
-from matd3_jax.training import checkpoint, condition
+from matd3_jax.training import checkpoint, checksums, condition
 from matd3_jax.training.condition import Condition
 
 
@@ -18,7 +18,7 @@ def main(argv: Sequence[str]) -> int:
 
     Raises UserError (exit code 2) where there is no run, or none that can be resumed.
     """
-    given = arguments.CHECK.parse(argv)
+    given = catalog.CHECK.parse(argv)
     if given.run is not None and given.sweep is None:
         return of_run(given.run)
     if given.sweep is not None and given.run is None:
@@ -50,7 +50,7 @@ def of_sweep(folder: Path) -> int:
         place = sweep.folder_of(number)
         steps = checkpoint.steps(place / "checkpoints")
         for step in steps:
-            why = checkpoint.damage(place / "checkpoints" / str(step))
+            why = checksums.damage(place / "checkpoints" / str(step))
             wrong += [f"checkpoint {place / 'checkpoints' / str(step)} is damaged ({why})"] if why else []
         finished, holder = True, lock.holder(place)
         for name in names:

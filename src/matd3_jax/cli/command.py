@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from matd3_jax.cli import arguments, options
+from matd3_jax.cli import catalog, options
 from matd3_jax.cli.options import Command
 from matd3_jax.errors import OptionError, UserError
 from matd3_jax.runtime import outside
@@ -25,7 +25,7 @@ DIVERGED = 3
 def start(name: str, argv: Sequence[str]) -> int:
     """Run one of our commands by its name: its exit code. Help needs none of what the command itself imports."""
     if options.asks_for_help(argv):
-        say(arguments.COMMANDS[name].help())
+        say(catalog.COMMANDS[name].help())
         return 0
     module = importlib.import_module(f"matd3_jax.cli.{name}")
     from matd3_jax.runtime import devices  # imports JAX, which help does without

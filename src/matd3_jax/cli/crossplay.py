@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from matd3_jax.cli import arguments
+from matd3_jax.cli import catalog
 from matd3_jax.cli.arguments import CrossPlay
 from matd3_jax.config import diff
 from matd3_jax.evaluation import entrants
@@ -24,7 +24,7 @@ from matd3_jax.runtime.terminal import say, show
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit code."""
-    options = arguments.CROSSPLAY.parse(argv)
+    options = catalog.CROSSPLAY.parse(argv)
     if options.out is not None:
         check_new_directory(options.out, "out")
     devices.prepare()

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from rich.table import Table
 
-from matd3_jax.cli import arguments
+from matd3_jax.cli import catalog
 from matd3_jax.core.rollout import Evaluation
 from matd3_jax.runs import divergence
 from matd3_jax.runs.directory import RunDirectory
@@ -20,7 +20,7 @@ from matd3_jax.training.state import TrainState
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit code."""
-    options = arguments.EVALUATE.parse(argv)
+    options = catalog.EVALUATE.parse(argv)
     devices.prepare()
     run, settings = RunDirectory.open(options.run)
     training = TrainingSession(settings)

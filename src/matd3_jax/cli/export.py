@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from matd3_jax.cli import arguments
+from matd3_jax.cli import catalog
 from matd3_jax.errors import UserError
 from matd3_jax.export import compare, export, onnx_file
 from matd3_jax.runs.directory import RunDirectory
@@ -15,7 +15,7 @@ from matd3_jax.training.session import TrainingSession
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit code."""
-    options = arguments.EXPORT.parse(argv)
+    options = catalog.EXPORT.parse(argv)
     if options.which is not None and options.checkpoint is not None:
         raise UserError(f"which={options.which} and checkpoint={options.checkpoint} both say which policies: give one")
     if options.format == "onnx":

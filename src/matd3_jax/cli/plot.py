@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from matd3_jax.cli import arguments
+from matd3_jax.cli import catalog
 from matd3_jax.cli.arguments import Plot
 from matd3_jax.config import diff
 from matd3_jax.errors import UserError, nearest
@@ -24,7 +24,7 @@ BANDS = {"t": "95 % interval", "bootstrap": "95 % bootstrap interval", "sd": "±
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit code."""
-    options = _checked(arguments.PLOT.parse(argv))
+    options = _checked(catalog.PLOT.parse(argv))
     groups = alike.groups(options.runs)
     settings = list(groups.values())
     found_labels = diff.label_differences(settings)

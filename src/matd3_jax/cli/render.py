@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from matd3_jax.cli import arguments
+from matd3_jax.cli import catalog
 from matd3_jax.errors import UserError
 from matd3_jax.evaluation import trajectory
 from matd3_jax.runs.directory import RunDirectory
@@ -21,7 +21,7 @@ PICTURES = 200
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit code."""
-    options = arguments.RENDER.parse(argv)
+    options = catalog.RENDER.parse(argv)
     devices.prepare()
     run, settings = RunDirectory.open(options.run)
     seed = settings.seed if options.seed is None else options.seed

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from matd3_jax.cli import arguments, command
+from matd3_jax.cli import catalog, command
 from matd3_jax.errors import UserError, one_line
 from matd3_jax.figures import learning_curves
 from matd3_jax.figures.learning_curves import Line, Panel
@@ -25,7 +25,7 @@ PICTURES = 100
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit code."""
-    options = arguments.REPORT.parse(argv)
+    options = catalog.REPORT.parse(argv)
     if options.out.suffix.lower() not in (".html", ".htm"):
         raise UserError(f"out={options.out}: must end with .html")
     if len(set(options.runs)) < len(options.runs):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from matd3_jax import config
-from matd3_jax.cli import arguments, command, options
+from matd3_jax.cli import catalog, command, options
 from matd3_jax.cli.arguments import Sweep as SweepOptions
 from matd3_jax.config import Config
 from matd3_jax.errors import UserError, nearest
@@ -40,7 +40,7 @@ METRIC = "return_agents"
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit code."""
-    given = arguments.SWEEP.parse(argv)
+    given = catalog.SWEEP.parse(argv)
     devices.prepare()
     own = [text for text in argv if options.key(text) not in slurm.KEYS]
     with multihost.start(given.processes()) as processes:
@@ -153,7 +153,7 @@ def read(overrides: Sequence[str], samples: int | None, seed: int) -> tuple[list
     for name, values in zip(search_space.names(space.axes, chosen), chosen, strict=True):
         try:
             settings[name or "run"] = config.load(
-                [*space.fixed, *(f"{k}={v}" for k, v in values.items())], arguments.SWEEP.keys
+                [*space.fixed, *(f"{k}={v}" for k, v in values.items())], catalog.SWEEP.keys
             )
         except UserError as error:
             swept = ", ".join(f"{key}={value}" for key, value in values.items())

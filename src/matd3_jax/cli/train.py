@@ -5,13 +5,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from matd3_jax import config
-from matd3_jax.cli import arguments, command, options
+from matd3_jax.cli import arguments, catalog, command, options
 from matd3_jax.config import Config, diff
 from matd3_jax.errors import UserError
 from matd3_jax.runs.paths import as_part, inside
 from matd3_jax.runtime import devices, multihost, slurm
 from matd3_jax.runtime.terminal import say
-from matd3_jax.training.recording import Recorded, Recorder
+from matd3_jax.training.recorded_run import Recorded
+from matd3_jax.training.recording import Recorder
 
 UNPICKLE = "env.pickle=true"
 """Given with resume=, it says that environments which the run pickled are to be trusted."""
@@ -19,9 +20,9 @@ UNPICKLE = "env.pickle=true"
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; the exit code."""
-    given = arguments.TRAIN.parse(argv)
+    given = catalog.TRAIN.parse(argv)
     if given.cfg:
-        say(config.text(config.load(given.settings, arguments.TRAIN.keys)), end="")
+        say(config.text(config.load(given.settings, catalog.TRAIN.keys)), end="")
         return 0
     devices.prepare()
     with multihost.start(given.processes()) as processes:
@@ -51,7 +52,7 @@ def _train(recorder: Recorder, given: arguments.Train) -> Recorded:
         return recorder.resume(given.resume, given.checkpoint, _total_steps(others), unpickle=unpickle)
     if given.checkpoint is not None:
         raise UserError("checkpoint= goes with resume=RUN_DIR")
-    settings = config.load(given.settings, arguments.TRAIN.keys)
+    settings = config.load(given.settings, catalog.TRAIN.keys)
     name = settings.name or _name(settings)
     return recorder.start(settings, inside(Path(settings.out), name, "name"), or_another=not settings.name)
 

@@ -22,7 +22,7 @@ from matd3_jax.training import checkpoint, film, finish, host_states, hybrid, st
 from matd3_jax.training import run as training_run
 from matd3_jax.training.film import Filmer
 from matd3_jax.training.loggers import CallbackLogger, DivergenceLogger, Logger, TableLogger
-from matd3_jax.training.memory import needed
+from matd3_jax.training.memory import needed, of_replay
 from matd3_jax.training.outputs import Outputs
 from matd3_jax.training.progress import ProgressBar
 from matd3_jax.training.rows import Row
@@ -237,5 +237,6 @@ class Batch:
         shown = ", ".join(names if len(names) <= 4 else [*names[:2], "...", names[-1]])
         say(f"{self.title}: {len(names)} runs, {seeds} seeds "
               f"in all, on {mesh.size} x {mesh.devices.flat[0].device_kind}{several}: {shown}")  # fmt: skip
-        say(f"{config.env['name']}, {training.total_steps:,} env steps each; {training.memory}; "
+        say(f"{config.env['name']}, {training.total_steps:,} env steps each; "
+              f"{of_replay(training.trainer, self.processes)}; "
               f"{needed(training.trainer, len(training.seeds)) / 1e9:.2f} GB in all")  # fmt: skip

@@ -8,7 +8,7 @@ from matd3_jax.runs import divergence, overestimation, summary
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runs.divergence import Divergence
 from matd3_jax.runtime import devices
-from matd3_jax.training import cost, starting
+from matd3_jax.training import cost, memory, starting
 from matd3_jax.training.session import TrainingSession
 
 ENGINES = {"c": "C MuJoCo", "mjx": "MuJoCo in JAX", "mjx_fast": "MuJoCo in JAX with brax's approximate settings"}
@@ -33,7 +33,7 @@ def first_lines(training: TrainingSession, run: RunDirectory, done: int = 0) -> 
         *starting.lines(settings),
         f"schedule: {settings.num_envs} x {settings.rollout_length} env steps, then {settings.updates_per_collect} "
         f"updates with {settings.batch_size} transitions",
-        training.memory,
+        memory.of_replay(training.trainer, training.processes),
         cost.expectation(training, done),
         *([f"note: {note}"] if note else []),
     ]

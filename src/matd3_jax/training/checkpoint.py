@@ -1,23 +1,20 @@
 """Checkpoints: everything a run carries, written with Orbax, checked by checksum before it is read back.
 
 Layout of one: `STEP/state` (all but the replay; several processes write `STEP/state/FIRST`, each its seeds, from number
-FIRST on), `STEP/replay/SEED` (the rows filled so far; none in what a sweep leaves of its runs), `STEP/best/SEED.npz`
-(see `training.best`), `STEP/host/SEED` (of environments on the host that are pickled), `STEP/metrics.json` (see
-`runs.table_digest`), `STEP/population.json` (of a sweep's population), `STEP/checksums.json`.
-A checkpoint appears under its name only when it is whole. The replay is written and read one seed at a time, so that it
-never stands in memory twice. What some processes wrote any other number of them can read.
+FIRST on), `STEP/replay/SEED` (the rows filled so far, see `training.saved_replay`; none in what a sweep leaves of its
+runs), `STEP/best/SEED.npz` (see `training.best`), `STEP/host/SEED` (of environments on the host that are pickled),
+`STEP/metrics.json` (see `runs.table_digest`), `STEP/population.json` (of a sweep's population), `STEP/checksums.json`
+(see `training.checksums`). A checkpoint appears under its name only when it is whole. What some processes wrote any
+other number of them can read.
 """
 
 import contextlib
 import glob
-import hashlib
 import json
 import logging
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -30,7 +27,7 @@ from matd3_jax.errors import UserError
 from matd3_jax.runs import table_digest
 from matd3_jax.runtime import files
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Share
-from matd3_jax.training import host_states
+from matd3_jax.training import checksums, host_states, saved_replay
 from matd3_jax.training.best import BestPolicies
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.state import TrainState
@@ -86,7 +83,7 @@ def save(
             checkpointer.save(there / written[0].relative_to(partial_), _leaves(trainer, state, own))
         if seeds is None and processes.first:
             (partial_ / "replay").mkdir(exist_ok=True)  # there even before the first row
-        for seed, rows in _replay_rows(trainer, state) if seeds is None else ():
+        for seed, rows in saved_replay.filled_rows(trainer, state) if seeds is None else ():
             if not rows.size:
                 continue  # Orbax does not write what has no numbers
             written.append(partial_ / "replay" / str(share.first + seed))
@@ -100,10 +97,9 @@ def save(
         written.append(table_digest.write(partial_, tables))
     if more is not None and processes.first:
         written.append(more(partial_))
-    parts = processes.gather_messages(json.dumps(_checksums(partial_, written)).encode())
+    parts = processes.gather_messages(json.dumps(checksums.of(partial_, written)).encode())
     if processes.first:
-        checksums = dict(sorted(pair for part in parts for pair in json.loads(part).items()))
-        files.write_json(partial_ / "checksums.json", checksums)
+        checksums.write(partial_, [json.loads(part) for part in parts])
         if final.is_symlink():
             _remove(final)
         elif final.exists():  # kept until its successor has its name
@@ -148,7 +144,7 @@ def recover(folder: Path) -> None:
     """
     for left in folder.glob(".*.partial"):
         final = folder / left.name.removeprefix(".").removesuffix(".partial")
-        if not final.exists() and final.name.isdigit() and damage(left) is None:
+        if not final.exists() and final.name.isdigit() and checksums.damage(left) is None:
             left.rename(final)
         else:
             shutil.rmtree(left, ignore_errors=True)
@@ -184,23 +180,12 @@ def verify(folder: Path, step: int | None = None) -> Path:
     if step not in found:
         raise UserError(f"{folder} holds no checkpoint of step {step}; there: {', '.join(map(str, found))}")
     path = folder.resolve() / str(step)
-    damaged = damage(path)
+    damaged = checksums.damage(path)
     if damaged is not None:
         before = [other for other in found if other < step]
         hint = f"resume from the one before it with checkpoint={before[-1]}" if before else "there is none before it"
         raise UserError(f"the checkpoint {folder / str(step)} is damaged ({damaged}); {hint}")
     return path
-
-
-def damage(path: Path) -> str | None:
-    """What is damaged or missing of the checkpoint at `path`; None where it is whole."""
-    try:
-        wanted = json.loads((path / "checksums.json").read_text(encoding="utf-8"))
-        return next((name for name, digest in wanted.items() if _digest(path / name) != digest), None)
-    except FileNotFoundError as error:
-        return f"{Path(str(error.filename)).relative_to(path)} is missing"
-    except (OSError, ValueError, AttributeError):
-        return "checksums.json"
 
 
 def restore(
@@ -223,40 +208,10 @@ def restore(
         raise UserError(f"{path} holds no replay: what a sweep leaves of a run can be evaluated, not resumed")
     share = share or SINGLE_PROCESS.share(trainer.num_seeds)
     small = _rebuild(trainer, path, share)
-    rows = restore_replay(path, trainer, share, int(small.rollouts))
+    rows = saved_replay.restore(path, trainer, share, int(small.rollouts))
     if best is not None:
         best.restore(path, share)
     return host_states.restored(path, trainer, small._replace(replay=rows), share, unpickle)
-
-
-def restore_replay(
-    path: Path,
-    trainer: TrainLoop,
-    share: Share,
-    rollouts: int,
-    convert: Callable[[np.ndarray], np.ndarray] = lambda rows: rows,
-) -> jax.Array:
-    """The replay in the checkpoint at `path`, after `rollouts` rollouts, one seed at a time. Raises UserError where it
-    does not fit the trainer.
-
-    Args:
-        convert: what its rows [rows, row size] become.
-    """
-    filled, local = trainer.schedule.filled_rows(rollouts), []
-    with ocp.StandardCheckpointer() as checkpointer:
-        for device, seeds in trainer.sharding.device_seeds():
-            shape = (len(seeds), trainer.schedule.replay_capacity, trainer.layout.row_size)
-            rows = jax.device_put(jnp.zeros(shape, jnp.float32, device=device), device)
-            for index, seed in enumerate(seeds):
-                if not filled:
-                    continue
-                one = convert(np.asarray(checkpointer.restore(path / "replay" / str(share.first + seed))["rows"]))
-                if one.shape[0] > shape[1] or one.shape[0] < filled or one.shape[1] != shape[2]:
-                    raise UserError(f"{path}: a replay of shape {one.shape} does not fit these settings")
-                rows = _put_rows(rows, jax.device_put(one[None], device), index)
-            local.append(rows)
-    shape = (trainer.sharding.padded_seeds, trainer.schedule.replay_capacity, trainer.layout.row_size)
-    return jax.make_array_from_single_device_arrays(shape, trainer.shardings.replay, local)
 
 
 def restore_actors(path: Path, trainer: TrainLoop, share: Share | None = None) -> TrainState:
@@ -281,23 +236,6 @@ def read_state(path: Path, first: int, last: int, total: int) -> dict[str, np.nd
     return {
         name: np.concatenate([part[name] for part in found]) if leaf.ndim else leaf for name, leaf in found[0].items()
     }
-
-
-@partial(jax.jit, donate_argnums=0, static_argnums=2)
-def _put_rows(rows: jax.Array, one: jax.Array, index: int) -> jax.Array:
-    return jax.lax.dynamic_update_slice(rows, one, (index, 0, 0))
-
-
-def _replay_rows(trainer: TrainLoop, state: TrainState):
-    """(seed number, its filled rows) one after the other."""
-    filled = trainer.schedule.filled_rows(int(state.rollouts))
-    for shard in state.replay.addressable_shards:
-        if shard.replica_id:
-            continue  # a copy on another device that works on the same seeds
-        first = shard.index[0].start or 0
-        for index in range(shard.data.shape[0]):
-            if first + index < trainer.num_seeds:
-                yield first + index, np.asarray(shard.data[index, :filled])
 
 
 def _leaves(trainer: TrainLoop, state: TrainState, seeds: slice) -> dict[str, np.ndarray]:
@@ -333,17 +271,3 @@ def _rebuild(trainer: TrainLoop, path: Path, share: Share) -> TrainState:
         replay=replay.allocate(trainer.sharding.padded_seeds, 0, 0),
     )
     return jax.device_put(state, trainer.shardings)
-
-
-def _checksums(path: Path, places: Sequence[Path]) -> dict[str, str]:
-    """Digests of files, and of all files in folders, by their names from `path` on."""
-    found = (file for place in places for file in (place, *place.rglob("*")) if file.is_file())
-    return {str(file.relative_to(path)): _digest(file, sync=True) for file in found}
-
-
-def _digest(path: Path, sync: bool = False) -> str:
-    """sync: bring the file to the disk, too, before anything is renamed."""
-    with path.open("rb") as file:
-        if sync:
-            os.fsync(file.fileno())
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -11,7 +11,7 @@ from matd3_jax.runs.directory import FORMAT, RunDirectory
 from matd3_jax.runs.metrics_table import MetricsTable
 from matd3_jax.runs.missing import Expected
 from matd3_jax.runtime import files
-from matd3_jax.training import best, checkpoint, starting
+from matd3_jax.training import best, checkpoint, checksums, starting
 from matd3_jax.training.session import TrainingSession
 
 SHOWN = 4
@@ -89,7 +89,7 @@ class Condition:
 def of_run(path: Path) -> Condition:
     """The condition of a run. Raises UserError where there is none, or its settings cannot be read."""
     run, settings = RunDirectory.open(path)
-    found = {step: checkpoint.damage(run.checkpoints / str(step)) for step in checkpoint.steps(run.checkpoints)}
+    found = {step: checksums.damage(run.checkpoints / str(step)) for step in checkpoint.steps(run.checkpoints)}
     damaged = {step: why for step, why in found.items() if why is not None}
     whole = tuple(step for step, why in found.items() if why is None)
     table, done = run.table(), whole[-1] if whole else 0

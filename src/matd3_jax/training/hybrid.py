@@ -20,7 +20,7 @@ from matd3_jax.runs.directory import START, RunDirectory
 from matd3_jax.runs.metrics_table import MetricsTable, number
 from matd3_jax.runtime import files
 from matd3_jax.runtime.multihost import Processes
-from matd3_jax.training import checkpoint, handover
+from matd3_jax.training import checkpoint, handover, saved_replay
 from matd3_jax.training.handover import Team
 from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import TrainState
@@ -127,7 +127,7 @@ def begin(training: TrainingSession, agents: TrainingSession, saved: Path) -> Tr
         reservoir=reservoir,
         earlier=small.earlier,
         stopped=small.stopped,
-        replay=checkpoint.restore_replay(saved, training.trainer, training.share, int(small.rollouts), order.rows),
+        replay=saved_replay.restore(saved, training.trainer, training.share, int(small.rollouts), order.rows),
     )
     return jax.device_put(state, training.trainer.shardings)
 

@@ -12,6 +12,7 @@ from matd3_jax.core import rollout
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.envs.environment import Environment
 from matd3_jax.errors import UserError
+from matd3_jax.runtime.multihost import Processes
 from matd3_jax.training import best
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.sharding import idle_devices
@@ -100,6 +101,20 @@ def check(parts: Sequence[Part], free: int, otherwise: str = "") -> None:
     raise UserError(
         f"{total / 1e9:,.2f} GB are needed, but only {free / 1e9:,.2f} GB are free; {most.size / 1e9:,.2f} GB for "
         f"{most.what}: {advice}{otherwise}"
+    )
+
+
+def of_replay(trainer: TrainLoop, processes: Processes) -> str:
+    """The arithmetic of the replay's memory."""
+    s = trainer.layout
+    copies = f"{trainer.sharding.devices_per_seed} copies x " if trainer.sharding.devices_per_seed > 1 else ""
+    whose = f" of process {processes.index}" if processes.size > 1 else ""
+    return (
+        f"replay{whose}: {trainer.sharding.padded_seeds} seeds x {copies}{trainer.schedule.replay_capacity:,} "
+        f"transitions x {s.row_size} numbers x 4 bytes = {trainer.replay_bytes / 1e9:.2f} GB "
+        f"(x {s.observation_size}, actions {s.action_size}, rewards "
+        f"{s.num_agents}, {'more 1, ' if s.n_step > 1 or s.recurrent else ''}"
+        f"{f'states {s.state_size}, ' if s.recurrent else ''}x' {s.observation_size}, discount 1)"
     )
 
 

@@ -1,11 +1,10 @@
-"""A run that leaves a directory: started, resumed from whatever a stop or a kill left, finished."""
+"""Runs that leave directories: started, or resumed from whatever a stop or a kill left."""
 
 import contextlib
 import shlex
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,26 +19,12 @@ from matd3_jax.runs.divergence import Divergence
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
 from matd3_jax.runtime.signals import Stop
-from matd3_jax.tracking.messages import FAILED, FINISHED, STOPPED
-from matd3_jax.training import announcement, best, checkpoint, finish, host_states, hybrid, outputs, starting
-from matd3_jax.training.film import Filmer
-from matd3_jax.training.loggers import CallbackLogger, DivergenceLogger, Logger, TableLogger, warn
-from matd3_jax.training.outputs import Outputs
-from matd3_jax.training.progress import ProgressBar
+from matd3_jax.training import announcement, checkpoint, host_states, hybrid, outputs, starting
+from matd3_jax.training.loggers import CallbackLogger, Logger
+from matd3_jax.training.recorded_run import Listeners, Recorded, RecordedRun, Say
 from matd3_jax.training.rows import Row
-from matd3_jax.training.run import Outcome, run
 from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import TrainState
-
-Say = Callable[[str], None]
-
-
-class Recorded(NamedTuple):
-    """A run when it is left."""
-
-    directory: RunDirectory
-    training: TrainingSession
-    outcome: Outcome
 
 
 class Recorder:
@@ -65,10 +50,9 @@ class Recorder:
         callback: Callable[[Row], object] | None = None,
         stop: Stop | None = None,
     ):
-        self.processes, self.loggers, self.callback = processes, loggers, callback
-        self.heed_signals, self.stop = heed_signals, stop
-        self.say: Say = say if say is not None and processes.first else lambda line: None
-        self.shows_progress = say is not None
+        self.processes, self.heed_signals, self.stop = processes, heed_signals, stop
+        self.listeners = Listeners(processes, say, loggers, callback)
+        self.say = self.listeners.say
         self.path: Path | None = None
         """Of the last run's directory, once it is there."""
 
@@ -170,16 +154,14 @@ class Recorder:
         if training.config.hands_over:
             return self._after_the_agents(training, directory, stop)
         state, row = training.start(starting.of_directory(directory.path))
-        watch = self._watch(training, {})
-        if self.processes.first:
-            directory.append(row)
-            watch.log(row)
-        return self._to_the_end(training, directory, state, row, stop, watch, fresh=True)
+        return RecordedRun(self.listeners, training, directory).train(state, row, stop, fresh=True)
 
     def _after_the_agents(self, training: TrainingSession, directory: RunDirectory, stop: Stop | None) -> Recorded:
         """Train the agents in a run directory of their own, then the one agent that takes over from them."""
-        rows = [CallbackLogger(logger.log) for logger in self.loggers]  # closed when the one agent is trained, too
-        part = Recorder(self.processes, False, self.say if self.shows_progress else None, rows, self.callback, stop)
+        loggers, callback = self.listeners.loggers, self.listeners.callback
+        rows = [CallbackLogger(logger.log) for logger in loggers]  # closed when the one agent is trained, too
+        say = self.say if self.listeners.shows_progress else None
+        part = Recorder(self.processes, False, say, rows, callback, stop)
         part_of, outcome = hybrid.train_agents(part, training, directory, self._machine())
         if outcome is not None and not outcome.finished:
             return Recorded(directory, part_of, outcome)
@@ -191,24 +173,8 @@ class Recorder:
             hybrid.write_table(training, part_of, directory)
         self.say(f"one agent takes over at env step {done:,}")
         row = {"step": np.array([done]), "updates": np.array([training.trainer.updates(int(state.rollouts))])}
-        watch = self._watch(training, self._diverged(training, directory, state, done))
-        return self._to_the_end(training, directory, state, row, stop, watch, save_first=True)
-
-    @property
-    def _tell(self) -> Say:
-        """What gets warnings."""
-        return self.say if self.shows_progress else warn
-
-    def _watch(self, training: TrainingSession, diverged: Mapping[int, Divergence]) -> DivergenceLogger:
-        """Knows what has diverged so far, given by the numbers of the seeds."""
-        known = {seed - training.config.seed: found for seed, found in diverged.items()}
-        return DivergenceLogger(training, self._tell, known)
-
-    def _outputs(self, training: TrainingSession, directory: RunDirectory, watch: DivergenceLogger) -> Outputs:
-        """The loggers beside the run's directory; none in other processes than the first."""
-        seeds, first = [slice(0, training.share.total)], self.processes.first
-        runs, members, own = ([directory], [training.config], self.loggers) if first else ([], [], ())
-        return Outputs(runs, members, seeds[: len(runs)], self._tell, self.say, watch.diverged, own=own)
+        diverged = self._diverged(training, directory, state, done)
+        return RecordedRun(self.listeners, training, directory, diverged).train(state, row, stop, save_first=True)
 
     def _diverged(
         self, training: TrainingSession, directory: RunDirectory, state: TrainState, step: int
@@ -240,19 +206,17 @@ class Recorder:
                 left = "all its seeds have diverged and stopped" if all_stopped else "to train on, raise total_steps="
                 raise UserError(where + left)
             state = checkpoint.restore(saved, training.trainer, training.share, best=training.best)
-            watch = self._watch(training, self._diverged(training, directory, state, done))
+            ended = RecordedRun(self.listeners, training, directory, self._diverged(training, directory, state, done))
             if self.processes.first:
                 self.say(f"{directory.path} has come to its end; its figures and its summary are made")
                 self._notes(training, directory, done)
-                with self._outputs(training, directory, watch) as out:
-                    self._finish(training, directory, done, {}, watch, out)
-            return Recorded(directory, training, Outcome(state, row, None, watch.diverged))
+            return ended.finish(state, row)
         if self.processes.first:
             for line in announcement.first_lines(training, directory, done):
                 self.say(line)
             self.say(f"resumed from the checkpoint of env step {done:,}")
             for line in host_states.notes(saved, training.trainer, unpickle):
-                self._tell(line)
+                self.listeners.tell(line)
         state = checkpoint.restore(saved, training.trainer, training.share, unpickle, training.best)
         self.processes.barrier()  # the files are changed only when all have what they need
         if self.processes.first:
@@ -263,99 +227,10 @@ class Recorder:
         diverged = self._diverged(training, directory, state, done)
         if diverged:
             self.say(f"note: {divergence.which(diverged)}")
-        return self._to_the_end(training, directory, state, row, stop, self._watch(training, diverged))
+        return RecordedRun(self.listeners, training, directory, diverged).train(state, row, stop)
 
     def _notes(self, training: TrainingSession, directory: RunDirectory, done: int) -> None:
         """Take the rows after env step `done` out of the metrics table, and say what it lacks."""
         saved = directory.checkpoints / str(done)
         for line in directory.cut(done, training.expected_table(training.config), saved):
             self.say(f"note: {line}")
-
-    def _to_the_end(
-        self,
-        training: TrainingSession,
-        directory: RunDirectory,
-        state: TrainState,
-        row: Row,
-        stop: Stop | None,
-        watch: DivergenceLogger,
-        fresh: bool = False,
-        save_first: bool = False,
-    ) -> Recorded:
-        """Train to the end, or until a signal comes or a seed diverges that must not."""
-        with self._outputs(training, directory, watch) as out:
-            return self._trained(training, directory, state, row, stop, watch, fresh, fresh or save_first, out)
-
-    def _trained(
-        self,
-        training: TrainingSession,
-        directory: RunDirectory,
-        state: TrainState,
-        row: Row,
-        stop: Stop | None,
-        watch: DivergenceLogger,
-        fresh: bool,
-        save_first: bool,
-        out: Outputs,
-    ) -> Recorded:
-        settings, begun = training.config, time.monotonic()
-        loggers: list[Logger] = []
-        progress = film = None
-        if self.processes.first:
-            loggers = [TableLogger([directory]), watch]
-            others = [CallbackLogger(out.log)]  # closed later: the summary is still to come
-            others += [] if self.callback is None else [CallbackLogger(self.callback)]
-            for logger in others if fresh else ():
-                logger.log(row)
-            if self.shows_progress:
-                progress = ProgressBar(training, row, watch.diverged)
-                loggers.append(progress)
-            loggers += others
-            if Filmer.wanted([settings]):
-                seeds = [slice(0, len(training.seeds))]
-                film = Filmer(training, [directory], [settings], seeds, self._tell, out.attach)
-
-        def save(state: TrainState, step: int) -> None:
-            keep = settings.keep_checkpoints
-            if self.processes.first:
-                directory.sync()
-            to = directory.checkpoints, step, training.trainer, state, keep
-            checkpoint.save(*to, share=training.share, best=training.best, tables=[directory.metrics])
-
-        outcome = run(training, state, row, loggers, save, stop, save_first, film)
-        step = int(outcome.row["step"][0])
-        save(outcome.state, step)
-        if self.processes.first:
-            if outcome.finished:
-                rates = {} if progress is None else progress.rates()
-                facts = {"seconds": round(time.monotonic() - begun, 1), **rates}
-                self._finish(training, directory, step, facts, watch, out)
-            else:
-                out.how = STOPPED if outcome.stopped is not None else FAILED
-                title, diverged = announcement.title(training), self._by_number(training, watch)
-                finish.draw(directory, training.layout, title, settings.diagnostics.q_bias, diverged)
-        return Recorded(directory, training, outcome)
-
-    def _finish(
-        self,
-        training: TrainingSession,
-        directory: RunDirectory,
-        done: int,
-        facts: dict,
-        watch: DivergenceLogger,
-        out: Outputs,
-    ) -> None:
-        diverged, with_q_bias = self._by_number(training, watch), training.config.diagnostics.q_bias
-        title = announcement.title(training)
-        last = directory.checkpoints / str(checkpoint.steps(directory.checkpoints)[-1])
-        numbers = training.config.seed_numbers
-        facts = {**facts, **best.summary(last, numbers)}
-        found = finish.finish(directory, training.layout, title, with_q_bias, done, facts, diverged)
-        for line in announcement.last_lines(training, directory, found, diverged):
-            self.say(line)
-        out.finish(0, found)
-        out.how = FINISHED
-
-    @staticmethod
-    def _by_number(training: TrainingSession, watch: DivergenceLogger) -> dict[int, Divergence]:
-        return {training.config.seed + place: found for place, found in sorted(watch.diverged.items())}

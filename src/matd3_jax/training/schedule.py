@@ -3,6 +3,8 @@
 import dataclasses
 import math
 
+from matd3_jax.config import Config
+
 
 @dataclasses.dataclass(frozen=True)
 class Schedule:
@@ -29,6 +31,22 @@ class Schedule:
     """Update the agents one after another (see `update.update`)."""
     random_order: bool = False
     """Move the actors one after another in random order (see `update.update`)."""
+
+    @classmethod
+    def of(cls, config: Config) -> "Schedule":
+        """That of a run with these settings, with room in the replay for all that they ask for."""
+        return cls(
+            num_envs=config.num_envs,
+            rollout_length=config.rollout_length,
+            updates_per_collect=config.updates_per_collect,
+            batch_size=config.batch_size,
+            replay_capacity=config.replay_capacity,
+            learning_starts=config.learning_starts,
+            warmup=config.warmup,
+            shared_minibatch=config.shared_minibatch,
+            sequential=config.update_order == "sequential",
+            random_order=config.update_order == "random_sequential",
+        )
 
     @property
     def rollout_steps(self) -> int:

@@ -17,13 +17,11 @@ from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.q_bias import Values
 from matd3_jax.core.rollout import Evaluation
 from matd3_jax.envs.environment import Environment
-from matd3_jax.envs.wrappers.joint_team import JointTeam
-from matd3_jax.errors import UserError
 from matd3_jax.runs import overestimation
 from matd3_jax.runs.missing import Expected
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.multihost import SINGLE_PROCESS, Processes
-from matd3_jax.training import handover, memory, rows, starting
+from matd3_jax.training import memory, rows, starting, teams
 from matd3_jax.training.best import BestPolicies
 from matd3_jax.training.clock import Clock
 from matd3_jax.training.evaluator import Evaluator
@@ -67,43 +65,12 @@ class TrainingSession:
         """Which of the seeds are trained in this process."""
         self.seeds = numbers[self.share.seeds]
         """[seeds] the number that each seed's key is made from."""
-        base = envs.make(**config.env) if env is None else env
-        if base.on_host and config.diagnostics.q_bias:
-            raise UserError(
-                f"diagnostics.q_bias=true puts environments back to earlier states, and {config.env['name']} is "
-                "stepped in Python and only goes forward: leave it false"
-            )
-        teams = config.teams()
-        if base.on_host and config.hands_over:
-            raise UserError(
-                f"algo=hybrid lets episodes go on with another environment, and {config.env['name']} is stepped in "
-                "Python: train algo=matd3, then algo=td3 with init="
-            )
-        if config.adversary is not None and "adversaries" not in base.teams:
-            raise UserError(f"adversary={config.adversary.name}: {config.env['name']} has no adversaries")
-        joint = tuple(team for team in dict.fromkeys(base.teams) if teams[team].joint)
-        algorithms = {team: algo.algorithm() for team, algo in teams.items()}
-        for team in joint:
-            if teams[team].hands_over:
-                algorithms[team] = handover.widened(algorithms[team], base.teams.count(team))
-            base = JointTeam(base, (team,), full=not teams[team].hands_over)
-        self.env = base
+        self.env, algorithms = teams.joined(config, envs.make(**config.env) if env is None else env)
         sequences = (config.sequence_length, config.burn_in) if config.recurrent else (1, 0)
         self.layout = JointLayout.of(self.env, algorithms, config.n_step, *sequences)
-        schedule = Schedule(
-            num_envs=config.num_envs,
-            rollout_length=config.rollout_length,
-            updates_per_collect=config.updates_per_collect,
-            batch_size=config.batch_size,
-            replay_capacity=config.replay_capacity,
-            learning_starts=config.learning_starts,
-            warmup=config.warmup,
-            shared_minibatch=config.shared_minibatch,
-            sequential=config.update_order == "sequential",
-            random_order=config.update_order == "random_sequential",
-        )
+        schedule = Schedule.of(config)
         self._each = [member for member in self.members for _ in range(member.seeds)]
-        hyper = {team: self._hyper(team) for team in teams}
+        hyper = {team: self._hyper(team) for team in config.teams()}
         seeds, normalize = len(self.seeds), config.normalize_observations
         local = jax.local_devices()
         least = config.normalize_least_deviation
@@ -151,27 +118,13 @@ class TrainingSession:
 
     # ---- memory ------------------------------------------------------------------------------------------------------
 
-    @property
-    def memory(self) -> str:
-        """The arithmetic of the replay's memory."""
-        t, s = self.trainer, self.layout
-        copies = f"{t.sharding.devices_per_seed} copies x " if t.sharding.devices_per_seed > 1 else ""
-        whose = f" of process {self.processes.index}" if self.processes.size > 1 else ""
-        return (
-            f"replay{whose}: {t.sharding.padded_seeds} seeds x {copies}{t.schedule.replay_capacity:,} transitions x "
-            f"{s.row_size} numbers x 4 bytes = {t.replay_bytes / 1e9:.2f} GB "
-            f"(x {s.observation_size}, actions {s.action_size}, rewards "
-            f"{s.num_agents}, {'more 1, ' if s.n_step > 1 or s.recurrent else ''}"
-            f"{f'states {s.state_size}, ' if s.recurrent else ''}x' {s.observation_size}, discount 1)"
-        )
-
     def check_memory(self, recorded: bool = False) -> None:
         """Raise UserError, with the arithmetic, unless everything that training takes fits into the memory that is
         free. recorded: checkpoints are written, too."""
         parts = memory.parts(self.trainer, len(self.seeds), self.config.eval_episodes if self.eval_every else 0)
         if not (recorded and self.trainer.on_cpu):
             del parts["checkpoint"]  # an accelerator's are made in the host's memory
-        parts["replay"] = parts["replay"]._replace(what=self.memory)
+        parts["replay"] = parts["replay"]._replace(what=memory.of_replay(self.trainer, self.processes))
         otherwise = ", or fewer seeds" if len(self.seeds) > 1 else ""
         memory.check(list(parts.values()), devices.free_memory(self.processes.local), otherwise)
 

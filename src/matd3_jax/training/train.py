@@ -22,7 +22,8 @@ from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import TrainState
 
 if TYPE_CHECKING:
-    from matd3_jax.training.recording import Recorded, Recorder
+    from matd3_jax.training.recorded_run import Recorded
+    from matd3_jax.training.recording import Recorder
 
 
 @dataclasses.dataclass
