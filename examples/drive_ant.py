@@ -33,9 +33,13 @@ def make():
     return env
 
 
-def full_observation(data):
-    """What Ant-v2 shows: positions without x and y, velocities, external torques and forces within [-1, 1]: [111]."""
-    return np.concatenate([data.qpos[2:], data.qvel, np.clip(data.cfrc_ext, -1, 1).ravel()])
+def full_observation(data, velocities=True):
+    """What Ant-v2 shows: positions without x and y, velocities, external torques and forces within [-1, 1]: [111].
+
+    velocities: False leaves them out, as `env.velocities=false` does: [97].
+    """
+    qvel = data.qvel if velocities else []
+    return np.concatenate([data.qpos[2:], qvel, np.clip(data.cfrc_ext, -1, 1).ravel()])
 
 
 def control(policies, facts, observation):
@@ -54,10 +58,11 @@ def episode(env, policies, facts, seed=None, start=None, after_step=None):
     """
     env.reset(seed=seed)
     robot, total = env.unwrapped, 0.0
+    velocities = facts["environment"].get("velocities", True)
     if start is not None:
         robot.set_state(*start)
     for _ in range(facts["environment"]["episode_length"]):
-        action = control(policies, facts, full_observation(robot.data))
+        action = control(policies, facts, full_observation(robot.data, velocities))
         _, _, terminated, _, info = env.step(action)
         alive = 1.0  # Ant-v5 does not pay on the step on which the robot falls
         total += info["reward_forward"] + alive + info["reward_ctrl"] + info["reward_contact"]

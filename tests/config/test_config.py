@@ -111,6 +111,26 @@ def test_settings_of_a_run_from_before_a_key_mean_what_they_meant(tmp_path):
     assert config.read(tmp_path / "config.yaml") == old
 
 
+@pytest.mark.parametrize(
+    ("name", "option", "other"),
+    [
+        ("simple_speaker_listener", "speaking_steps", 3),
+        ("humanoid", "velocities", False),
+        ("brax_ant", "velocities", False),
+    ],
+)
+def test_runs_from_before_an_option_of_their_environment(name, option, other, tmp_path):
+    """They had its default, so that they belong to those of today that have it."""
+    settings = config.load([f"env={name}"])
+    old = settings.to_dict()
+    del old["env"][option]
+    (tmp_path / "config.yaml").write_text(json.dumps(old))
+    assert config.read(tmp_path / "config.yaml") == settings
+    old["env"][option] = other
+    (tmp_path / "config.yaml").write_text(json.dumps(old))
+    assert config.read(tmp_path / "config.yaml").env[option] == other
+
+
 def test_keys_have_had_other_names(tmp_path):
     """Runs from before are read; who writes an old name is given the new one."""
     settings = config.load(["env=simple_tag", "adversary=maddpg", "normalize_observations=true"])

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from gru_reference import one_step
 from ledger import HYPER
 
 from matd3_jax import envs
@@ -15,15 +16,6 @@ from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.core.minibatch import Noise
 
 UNITS, SEQUENCES, LENGTH, BURN_IN = 3, 5, 4, 2
-
-
-def one_step(p, h, z):
-    """A gated recurrent unit in NumPy: its equations once more."""
-    kernel, own = (np.split(p[name], 3, axis=-1) for name in ("kernel", "recurrent_kernel"))
-    bias = np.split(p["bias"], 3, axis=-1)
-    update, reset = (1 / (1 + np.exp(-(z @ kernel[k] + bias[k] + h @ own[k]))) for k in range(2))
-    candidate = np.tanh(z @ kernel[2] + bias[2] + reset * (h @ own[2] + p["candidate_bias"]))
-    return (1 - update) * candidate + update * h
 
 
 def unrolled(p, warm, inputs, more, start):

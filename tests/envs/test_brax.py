@@ -249,6 +249,35 @@ def test_humanoid_s_bodies_are_brax_s_links():
     assert layout.entry("qfrc_actuator", 0) == (221,) and layout.entry("qfrc_actuator", 22) == (243,)
 
 
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_without_velocities(robot):
+    """Of what brax shows, each entry known by its number: all but MuJoCo's nv and six for each link of the humanoid."""
+    usual, env = make(f"brax_{robot}"), make(f"brax_{robot}", velocities=False)
+    model, size = env.mj_model, ROBOTS[robot][1]
+    first = model.nq - models.FACTS[robot].hidden
+    gone = {*range(first, first + model.nv)} | ({*range(155, 221)} if robot == "humanoid" else set())
+    state = BraxState(None, jnp.arange(size), jnp.zeros(0), jnp.int32(0))
+    whole = [i for i in range(size) if i not in gone]
+    assert env.full_observation(state).tolist() == whole and env.full_observation_size == len(whole)
+    for a, b, many in zip(env.observe(state), usual.observe(state), env.observation_sizes, strict=True):
+        assert a.tolist() == [i for i in b.tolist() if i not in gone] and len(a) == many < len(b)
+    assert all("velocity" not in name for name in env.full_observation_names)
+    wanted = [name for name in usual.full_observation_names if "velocity" not in name]
+    assert list(env.full_observation_names) == wanted
+
+
+def test_steps_without_velocities():
+    usual, env = make("brax_hopper"), make("brax_hopper", velocities=False)
+    state, start = jax.jit(env.reset)(jax.random.key(0))
+    after = jax.jit(lambda state: env.step(None, state, tuple(jnp.ones(1) for _ in env.agents)))(state)
+    for state_, seen in ((state, start), (after.state, after.observation)):
+        full = usual.full_observation(state_)
+        assert full.shape == (11,)
+        np.testing.assert_array_equal(env.full_observation(state_), full[:5])
+        for own, entries in zip(seen, env.partition.observations, strict=True):
+            np.testing.assert_array_equal(own, full[np.array(entries)])
+
+
 def test_first_use_within_a_trace_leaves_nothing_of_it_behind():
     models.load.cache_clear()
     jax.eval_shape(lambda key: make("brax_hopper").reset(key), jax.random.key(0))
@@ -296,6 +325,7 @@ def test_brax_is_not_there(monkeypatch):
         ("brax_ant", {"split": 4}, ["split=4", "joint names"]),
         ("brax_ant", {"depth": -1}, ["depth=-1", "at least 0"]),
         ("brax_ant", {"split": "4x2", "depth": True}, ["depth=True", "integer"]),
+        ("brax_ant", {"velocities": 1}, ["velocities=1", "true or false"]),
         ("brax_ant", {"episode_length": 0}, ["episode_length=0", "at least 1"]),
         ("brax_ants", {}, ["'brax_ants'", "did you mean 'brax_ant'"]),
         ("brax_ant", {"dept": 1}, ["'dept'", "did you mean 'depth'"]),

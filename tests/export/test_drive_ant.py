@@ -24,7 +24,9 @@ def example():
     return module
 
 
-@pytest.mark.parametrize("lines", [["env.split=halves"], ["algo=td3", "env.split=2x4"]], ids=str)
+@pytest.mark.parametrize(
+    "lines", [["env.split=halves"], ["algo=td3", "env.split=2x4"], ["env.velocities=false"]], ids=str
+)
 def test_an_episode_has_the_return_of_our_own_evaluation(example, lines, tmp_path):
     """From the same start: the first 20 env steps to 1e-3 by themselves, all 100 to 1e-4 on our episode's states.
 

@@ -171,6 +171,21 @@ def test_entries_that_nobody_saw_have_no_statistics(tmp_path):
     assert len(unseen) == 12 and not joined[:, unseen].any() and joined.shape == (2, size, 8)
 
 
+@pytest.mark.parametrize(
+    ("before", "now", "sizes"), [(True, False, "111 numbers there, 97"), (False, True, "97 numbers there, 111")]
+)
+def test_one_agent_that_sees_other_entries_is_refused(before, now, sizes):
+    """The Ant's agents learned with velocities, and one agent goes on without, or the other way around."""
+    one = Algorithm(joint=True)
+    there = JointLayout.of(ant := envs.make("ant", physics="c", velocities=before), {"agents": Algorithm()})
+    here = JointLayout.of(JointTeam(envs.make("ant", physics="c", velocities=now)), {"agents": one})
+    team = handover.Team.of("init=x", "agents", there, ant)
+    with pytest.raises(UserError, match=f"^init=x: one agent in the place of agents sees {sizes} here$"):
+        handover.networks("init=x", team, [], there, here, 0)
+    with pytest.raises(UserError, match=sizes):
+        handover.statistics("init=x", team, [], here.observation_sizes[0])
+
+
 def test_whose_critics_see_more_than_the_one_agent_s(tmp_path):
     """One agent in the place of one of two teams has to see the other, too."""
     env = envs.make("simple_adversary")

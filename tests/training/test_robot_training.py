@@ -44,6 +44,8 @@ def test_the_ant_trains_and_is_evaluated(physics):
         (["algo=ddpg", "env.split=4x2"], (111,), (8,)),
         (["algo=iltd3", "env.split=4x2", "env.depth=2"], (45,) * 4, (2,) * 4),
         (["algo=maddpg", "env.split=single"], (111,), (8,)),
+        (["algo=matd3", "env.velocities=false"], (49, 49), (4, 4)),
+        (["algo=td3", "env.velocities=false"], (97,), (8,)),
         (["algo=matd3", "env.split=[[hip_1,hip_2,hip_3,hip_4],[ankle_1,ankle_2,ankle_3,ankle_4]]"], (71, 47), (4, 4)),
     ],
 )
@@ -62,10 +64,17 @@ OPTIONS = (
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("env", "seeds"), [("ant", 3), ("humanoid", 1)])
-def test_a_resumed_robot_is_the_same_to_the_bit(env, seeds, tmp_path):
+@pytest.mark.parametrize(
+    ("env", "seeds", "more"),
+    [
+        ("ant", 3, ()),
+        ("humanoid", 1, ()),
+        ("hopper", 1, ("env.velocities=false", "normalize_observations=true")),
+    ],
+)
+def test_a_resumed_robot_is_the_same_to_the_bit(env, seeds, more, tmp_path):
     """With C physics, whatever carries state: the solver's start, noise quantiles, averaged actors, the reservoir."""
-    settings = config.load([f"env={env}", "env.physics=c", *OPTIONS, f"seeds={seeds}", "total_steps=400"])
+    settings = config.load([f"env={env}", "env.physics=c", *OPTIONS, *more, f"seeds={seeds}", "total_steps=400"])
 
     def go_on(training, state):
         rows = []

@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from matd3_jax.config.plain_values import environment, from_dict
-from matd3_jax.config.schema import ADDED_LATER, RENAMED, Config
+from matd3_jax.config.schema import ADDED_LATER, OPTIONS_ADDED_LATER, RENAMED, Config
 from matd3_jax.errors import UserError, one_line
 from matd3_jax.runtime import files
 
@@ -28,7 +28,9 @@ def read(path: Path) -> Config:
         if not isinstance(found, dict):
             raise UserError("it has no settings")
         values = _with_defaults(with_logger_list(renamed(found)), ADDED_LATER)
-        if "physics" in environment(values):
+        env = environment(values)
+        values["env"] = {**OPTIONS_ADDED_LATER.get(env["name"], {}), **env}
+        if "physics" in env:
             from matd3_jax.envs.robots.engines.engine import RENAMED
 
             physics = values["env"]["physics"]

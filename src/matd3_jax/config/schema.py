@@ -272,6 +272,14 @@ ADDED_LATER = {
 }
 """Keys that runs from before them lack, with the values that those runs had in effect; a group may lack some, too."""
 
+_ROBOTS = ("ant", "half_cheetah", "hopper", "walker2d", "humanoid", "swimmer")
+
+OPTIONS_ADDED_LATER: dict[str, dict[str, Any]] = {
+    "simple_speaker_listener": {"speaking_steps": None},
+    **{f"{engine}{robot}": {"velocities": True} for robot in _ROBOTS for engine in ("", "brax_")},
+}
+"""Options of environments that runs from before them lack, with the values that those runs had in effect."""
+
 RENAMED = {
     "normalise_observations": "normalize_observations",
     "normalise_least_deviation": "normalize_least_deviation",

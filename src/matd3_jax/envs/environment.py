@@ -176,6 +176,12 @@ def check_choice(key: str, value: object, allowed: tuple[str, ...]) -> None:
         raise OptionError(f"{key}={value!r}: must be one of {', '.join(map(repr, allowed))}")
 
 
+def check_flag(key: str, value: object) -> None:
+    """Raise OptionError unless `value` is True or False."""
+    if not isinstance(value, bool):
+        raise OptionError(f"{key}={value!r}: must be true or false")
+
+
 def check_count(key: str, value: object, least: int) -> None:
     """Raise OptionError unless `value` is an integer of at least `least`."""
     if not isinstance(value, int) or isinstance(value, bool) or value < least:

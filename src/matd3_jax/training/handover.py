@@ -37,6 +37,8 @@ class Team(NamedTuple):
     """Their numbers in the layout that they learned in."""
     entries: tuple[tuple[int, ...], ...]
     """For each of them where the entries of its observation are in that of the one agent."""
+    size: int
+    """Entries of what the one agent sees in the environment that they learned in."""
 
     @classmethod
     def of(cls, source: str, name: str, layout: JointLayout, env: Environment, full: bool = True) -> "Team":
@@ -49,14 +51,22 @@ class Team(NamedTuple):
         """
         agents = tuple(i for i, team in enumerate(layout.teams) if team == name)
         if not full or len(agents) < layout.num_agents:  # one agent for one of several teams never sees the full one
-            return cls(name, agents, consecutive([layout.observation_sizes[i] for i in agents]))
+            sizes = [layout.observation_sizes[i] for i in agents]
+            return cls(name, agents, consecutive(sizes), sum(sizes))
         entries = innermost(env).entries_in_full_observation
         if entries is None:
             raise UserError(
                 f"{source}: one agent sees the environment's own full observation, and where those of the agents are "
                 "in it is not known"
             )
-        return cls(name, agents, entries)
+        return cls(name, agents, entries, innermost(env).full_observation_size)
+
+    def check_size(self, source: str, size: int) -> None:
+        """Raise UserError unless the one agent sees here, `size` entries, what it sees there."""
+        if size != self.size:
+            raise UserError(
+                f"{source}: one agent in the place of {self.name} sees {self.size} numbers there, {size} here"
+            )
 
     def check_widths(self, source: str, there: Algorithm, here: Algorithm) -> None:
         """Raise UserError unless the hidden layers of the one agent `here` hold those of all agents."""
@@ -176,6 +186,7 @@ def networks(
     for field, plain in (("actor", "mlp"), ("critic_head", "scalar"), ("critic_norm", "none")):
         if getattr(wanted, field) != plain:
             raise UserError(f"{source}: networks stand side by side in those of one agent with {field}={plain} only")
+    team.check_size(source, here.observation_sizes[one])
     team.check_widths(source, there.algorithms[team.agents[0]], wanted)
     columns = critic_columns(source, team, there, here, one)
     size, inputs = here.observation_sizes[one], critic_input_size(here, here.groups[here.place(one)[0]])
@@ -204,8 +215,9 @@ def networks(
 def statistics(source: str, team: Team, parts: Sequence[Statistics], size: int) -> Statistics:
     """Statistics of what one agent sees from those of what the agents saw, leading axis [seeds].
 
-    Raises UserError where one agent sees more than they did.
+    Raises UserError where one agent sees more than they did, or not what it sees in their environment.
     """
+    team.check_size(source, size)
     unseen = set(range(size)) - {entry for entries in team.entries for entry in entries}
     if unseen:
         raise UserError(

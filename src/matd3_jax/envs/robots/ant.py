@@ -34,7 +34,7 @@ class Ant(Robot):
 
     @property
     def layout(self) -> Layout:
-        return lay_out(15, 14, hidden=2, cfrc_ext=range(14))
+        return lay_out(15, 14, hidden=2, cfrc_ext=range(14), velocities=self.velocities)
 
     def noise(self, key: chex.PRNGKey) -> tuple[chex.Array, chex.Array]:
         qpos_key, qvel_key = jax.random.split(key)

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from matd3_jax.envs.environment import LIMIT, Environment, TimeStep, check_choice, check_count
+from matd3_jax.envs.environment import LIMIT, Environment, TimeStep, check_choice, check_count, check_flag
 from matd3_jax.envs.robots import brax_models as models
 from matd3_jax.envs.robots import names
-from matd3_jax.envs.robots.partition.partition import Partition, Split, as_split, partition
+from matd3_jax.envs.robots.partition.partition import Layout, Partition, Split, as_split, partition
 from matd3_jax.envs.spaces import Box
 
 
@@ -22,7 +22,7 @@ class BraxState(NamedTuple):
     pipeline: Any
     """brax's physics state; `q` and `qd` in it are the generalized positions and velocities."""
     full_observation: chex.Array
-    """[full_observation_size]; kept, as the humanoid's shows the last action's forces, which the physics forgets."""
+    """brax's, with velocities; kept, as the humanoid's shows the last action's forces, which the physics forgets."""
     measured: chex.Array
     """[len(measures)]."""
     step: chex.Array
@@ -41,7 +41,7 @@ class BraxRobot(Environment):
     The full observation is brax's: generalized positions without those along the floor, and velocities (m, rad, m/s,
     rad/s; hopper's and walker2d's velocities clipped to [-10, 10]). The humanoid's continues with inertia [10] and
     velocity [6] of each of 11 links and the motors' forces [23]. No contact forces. Sizes: ant 27, half_cheetah 17,
-    hopper 11, walker2d 17, humanoid 244, swimmer 8.
+    hopper 11, walker2d 17, humanoid 244, swimmer 8. With `velocities` False it lacks those of joints, root and links.
 
     An episode terminates where brax says so (half_cheetah and swimmer never do) and, with reward 0, when the physics
     blows up: an entry of the state is not finite or exceeds `base.LIMIT`. It is truncated after `episode_length` steps.
@@ -58,11 +58,13 @@ class BraxRobot(Environment):
     backend: str = "spring"
     split: Split = "halves"
     depth: int | None = None
+    velocities: bool = True
     episode_length: int = 1000  # type: ignore[misc]  # a field in place of the property
 
     def __post_init__(self) -> None:
         check_choice("backend", self.backend, models.FACTS[self.robot].backends)
         check_count("episode_length", self.episode_length, 1)
+        check_flag("velocities", self.velocities)
         object.__setattr__(self, "split", as_split(self.split))
         models.import_brax()
         self.partition  # noqa: B018  # refuses what does not fit
@@ -71,7 +73,12 @@ class BraxRobot(Environment):
     @property
     def partition(self) -> Partition:
         """Who moves and sees what."""
-        return _partition(self.robot, self.split, self.depth)
+        return _partition(self.robot, self.split, self.depth, self.velocities)
+
+    @property
+    def layout(self) -> Layout:
+        """Where each quantity stands in the full observation."""
+        return models.layout(self.robot, self.velocities)
 
     @property
     def agents(self) -> tuple[str, ...]:
@@ -95,7 +102,7 @@ class BraxRobot(Environment):
 
     @property
     def full_observation_size(self) -> int:
-        return models.layout(self.robot).size
+        return self.layout.size
 
     @property
     def observation_names(self) -> tuple[tuple[str, ...], ...]:
@@ -103,7 +110,7 @@ class BraxRobot(Environment):
 
     @property
     def full_observation_names(self) -> tuple[str, ...]:
-        return names.full_observation(models.layout(self.robot), self.mj_model)
+        return names.full_observation(self.layout, self.mj_model)
 
     @property
     def action_names(self) -> tuple[tuple[str, ...], ...]:
@@ -171,10 +178,13 @@ class BraxRobot(Environment):
         )
 
     def observe(self, state: BraxState) -> tuple[chex.Array, ...]:
-        return tuple(state.full_observation[np.array(own)] for own in self.partition.observations)
+        full = self.full_observation(state)
+        return tuple(full[np.array(own)] for own in self.partition.observations)
 
     def full_observation(self, state: BraxState) -> chex.Array:
-        return state.full_observation
+        if self.velocities:
+            return state.full_observation
+        return state.full_observation[np.array(models.without_velocities(self.robot))]
 
     def measure(self, state: BraxState) -> chex.Array:
         return state.measured
@@ -229,8 +239,8 @@ class BraxSwimmer(BraxRobot):
 
 
 @functools.lru_cache(maxsize=None, typed=True)  # typed: depth True is refused though 1 is known
-def _partition(robot: str, split: Split, depth: int | None) -> Partition:
-    return partition(robot, models.tree(robot), models.layout(robot), split, depth)
+def _partition(robot: str, split: Split, depth: int | None, velocities: bool) -> Partition:
+    return partition(robot, models.tree(robot), models.layout(robot, velocities), split, depth)
 
 
 def _canonical(state: BraxState) -> BraxState:

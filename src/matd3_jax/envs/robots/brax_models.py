@@ -101,11 +101,22 @@ def tree(robot: str) -> KinematicTree:
 
 
 @functools.cache
-def layout(robot: str) -> Layout:
-    """Where everything stands in brax's observation."""
+def layout(robot: str, velocities: bool = True) -> Layout:
+    """Where everything stands in brax's observation, with or without its velocities."""
     model, hidden = mj_model(robot), FACTS[robot].hidden
     if robot != "humanoid":
-        return lay_out(model.nq, model.nv, hidden)
+        return lay_out(model.nq, model.nv, hidden, velocities=velocities)
     # brax shows its links: the bodies that have joints. The feet belong to the shins.
     links = [body for body in range(1, model.nbody) if model.body_jntnum[body]]
-    return lay_out(model.nq, model.nv, hidden, cinert=links, cvel=links, qfrc_actuator=range(model.nv))
+    return lay_out(
+        model.nq, model.nv, hidden, cinert=links, cvel=links, qfrc_actuator=range(model.nv), velocities=velocities
+    )
+
+
+@functools.cache
+def without_velocities(robot: str) -> tuple[int, ...]:
+    """Of brax's observation the entries that `layout` has without velocities, in their order."""
+    whole = layout(robot)
+    velocities = {i for k in range(len(whole.qvel)) for i in whole.entry("qvel", k)}
+    velocities |= {i for k in range(len(whole.cvel)) for i in whole.entry("cvel", k)}
+    return tuple(i for i in range(whole.size) if i not in velocities)

@@ -37,7 +37,16 @@ class Humanoid(Robot):
     @property
     def layout(self) -> Layout:
         bodies = range(1, 14)
-        return lay_out(24, 23, hidden=2, cinert=bodies, cvel=bodies, qfrc_actuator=range(6, 23), cfrc_ext=bodies)
+        return lay_out(
+            24,
+            23,
+            hidden=2,
+            cinert=bodies,
+            cvel=bodies,
+            qfrc_actuator=range(6, 23),
+            cfrc_ext=bodies,
+            velocities=self.velocities,
+        )
 
     def noise(self, key: chex.PRNGKey) -> tuple[chex.Array, chex.Array]:
         qpos_key, qvel_key = jax.random.split(key)
@@ -53,7 +62,8 @@ class Humanoid(Robot):
 
     def sense(self, physical: Physical) -> tuple[chex.Array, ...]:
         found = physical.fields
-        return found["cinert"][1:], found["cvel"][1:], found["qfrc_actuator"][6:], found["cfrc_ext"][1:]
+        bodies = ("cinert", "cvel") if self.velocities else ("cinert",)
+        return *(found[name][1:] for name in bodies), found["qfrc_actuator"][6:], found["cfrc_ext"][1:]
 
     def start(self, qpos: chex.Array, qvel: chex.Array) -> tuple[tuple[chex.Array, ...], chex.Array]:
         physical = self._engine.place(qpos, qvel, self.reads)

@@ -27,7 +27,7 @@ class Planar(Robot):
 
     @property
     def layout(self) -> Layout:
-        return lay_out(self.mj_model.nq, self.mj_model.nv, hidden=self.hidden)
+        return lay_out(self.mj_model.nq, self.mj_model.nv, hidden=self.hidden, velocities=self.velocities)
 
     def noise(self, key: chex.PRNGKey) -> tuple[chex.Array, chex.Array]:
         qpos_key, qvel_key = jax.random.split(key)

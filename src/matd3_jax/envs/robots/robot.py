@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from matd3_jax.envs.environment import LIMIT, Environment, TimeStep, check_count
+from matd3_jax.envs.environment import LIMIT, Environment, TimeStep, check_count, check_flag
 from matd3_jax.envs.robots import names
 from matd3_jax.envs.robots.engines import engine
 from matd3_jax.envs.robots.engines.engine import Engine, Physical
@@ -50,6 +50,11 @@ class Robot(Environment):
     (`partition.partition`), `episode_length` in env steps. Actions are controls in the model's range. A state that
     blows up (an entry not finite or beyond `base.LIMIT`) terminates the episode with reward 0.
 
+    `velocities`: whether velocities are observed: those of joints and root (qvel), and of bodies (cvel, the humanoid
+    alone). Without them the full observation lacks these entries and is as much shorter. What else is observed stays:
+    positions, inertias, forces of actuators (the humanoid's motors: the last action times constants), and external
+    forces, the contacts'. Rewards, terminations and physics are the same.
+
     `measures`, means over env steps: forward_velocity (m/s), and the parts of the reward (reward_forward,
     reward_survive, reward_ctrl, reward_contact).
 
@@ -59,6 +64,7 @@ class Robot(Environment):
     physics: str = "auto"
     split: Split = "single"
     depth: int | None = None
+    velocities: bool = True
     episode_length: int = 1000  # type: ignore[misc]  # a field in place of the property
 
     robot: ClassVar[str]
@@ -74,6 +80,7 @@ class Robot(Environment):
     def __post_init__(self) -> None:
         object.__setattr__(self, "physics", engine.resolve(self.physics))
         check_count("episode_length", self.episode_length, 1)
+        check_flag("velocities", self.velocities)
         object.__setattr__(self, "split", as_split(self.split))
         self.partition  # noqa: B018  # raises for impossible splits
 
@@ -192,12 +199,14 @@ class Robot(Environment):
         return tuple(full[np.array(entries)] for entries in self.partition.observations)
 
     def full_observation(self, state: RobotState) -> chex.Array:
-        """What gymnasium shows a single agent: [full_observation_size]; kept within `base.LIMIT`, 0 for NaN."""
+        """What gymnasium shows a single agent, velocities only if they are to be seen: [full_observation_size]; kept
+        within `base.LIMIT`, 0 for NaN."""
         return jnp.clip(jnp.nan_to_num(self.raw_observation(state), posinf=LIMIT, neginf=-LIMIT), -LIMIT, LIMIT)
 
     def raw_observation(self, state: RobotState) -> chex.Array:
         hidden = self.layout.qpos.count(None)
-        return jnp.concatenate([state.qpos[hidden:], state.qvel, *(part.ravel() for part in state.sensed)])
+        qvel = (state.qvel,) if self.velocities else ()
+        return jnp.concatenate([state.qpos[hidden:], *qvel, *(part.ravel() for part in state.sensed)])
 
     def measure(self, state: RobotState) -> chex.Array:
         return jnp.concatenate([state.terms[:1] / self.forward_weight, state.terms])

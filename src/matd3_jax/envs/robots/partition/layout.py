@@ -40,10 +40,12 @@ def lay_out(
     cvel: Sequence[int] = (),
     qfrc_actuator: Sequence[int] = (),
     cfrc_ext: Sequence[int] = (),
+    velocities: bool = True,
 ) -> Layout:
     """The layout of qpos[hidden:], qvel, cinert, cvel, qfrc_actuator, cfrc_ext, one behind the other.
 
-    `cinert`, `cvel`, `cfrc_ext`: bodies shown, `qfrc_actuator`: degrees of freedom shown, in their order.
+    `cinert`, `cvel`, `cfrc_ext`: bodies shown, `qfrc_actuator`: degrees of freedom shown, in their order. `velocities`:
+    whether qvel and cvel are shown at all.
     """
     end = 0
 
@@ -55,9 +57,9 @@ def lay_out(
 
     return Layout(
         qpos=place(range(hidden, num_qpos)),
-        qvel=place(range(num_qvel)),
+        qvel=place(range(num_qvel) if velocities else ()),
         cinert=place(cinert, _WIDTHS["cinert"]),
-        cvel=place(cvel, _WIDTHS["cvel"]),
+        cvel=place(cvel if velocities else (), _WIDTHS["cvel"]),
         qfrc_actuator=place(qfrc_actuator),
         cfrc_ext=place(cfrc_ext, _WIDTHS["cfrc_ext"]),
         size=end,
