@@ -170,7 +170,7 @@ def _check_recurrent(name: str, team: "AlgoConfig", config: "Config", need: Any)
         return
     key = f"{name}.actor=gru"
     need(not team.frozen, f"{name}.policy={team.policy}: its actors are recurrent, and frozen teams play others alone")
-    need(config.n_step == 1, f"{key} has targets of one step: leave n_step={config.n_step} out")
+    need(config.n_step == 1, f"{key} has targets of one step: give n_step=1")
     need(team.share_parameters == "none", f"{key} has networks for each agent: leave {name}.share_parameters out")
     need(team.critic != "shared", f"{key} has critics for each agent: leave {name}.critic=shared out")
     need(

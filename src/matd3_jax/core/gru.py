@@ -11,7 +11,6 @@ import math
 from typing import NamedTuple
 
 import chex
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
@@ -35,22 +34,21 @@ class History(NamedTuple):
 def init(key: chex.PRNGKey, stack: tuple[int, ...], inputs: int, units: int) -> chex.ArrayTree:
     """Draw fresh parameters with leading axes `stack`, three gates side by side: update, reset, candidate.
 
-    Input kernels are LeCun normal, recurrent ones orthogonal for each gate, biases zero.
+    Kernels are uniform within 1 / sqrt(units), PyTorch's way; biases zero. Orthogonal kernels would need a
+    factorization, for which XLA's threads on a CPU can wait forever (see `thread_pool`).
     """
+    input_key, own_key = jax.random.split(key)
+    bound = 1 / math.sqrt(units)
 
-    def one(key: chex.PRNGKey) -> chex.ArrayTree:
-        keys = jax.random.split(key, 6)
-        kernels = [nn.initializers.lecun_normal()(k, (inputs, units)) for k in keys[:3]]
-        own = [nn.initializers.orthogonal()(k, (units, units)) for k in keys[3:]]
-        return {
-            "kernel": jnp.concatenate(kernels, axis=-1),
-            "bias": jnp.zeros(3 * units),
-            "recurrent_kernel": jnp.concatenate(own, axis=-1),
-            "candidate_bias": jnp.zeros(units),
-        }
+    def uniform(key: chex.PRNGKey, rows: int) -> chex.Array:
+        return jax.random.uniform(key, (*stack, rows, 3 * units), minval=-bound, maxval=bound)
 
-    each = jax.vmap(one)(jax.random.split(key, math.prod(stack)))
-    return jax.tree.map(lambda leaf: leaf.reshape(*stack, *leaf.shape[1:]), each)
+    return {
+        "kernel": uniform(input_key, inputs),
+        "bias": jnp.zeros((*stack, 3 * units)),
+        "recurrent_kernel": uniform(own_key, units),
+        "candidate_bias": jnp.zeros((*stack, units)),
+    }
 
 
 def step(params: chex.ArrayTree, state: chex.Array, inputs: chex.Array) -> chex.Array:
