@@ -270,7 +270,8 @@ def test_it_goes_with_other_settings(more):
 @pytest.mark.parametrize("more", [[KIND], [TEAM, KIND]], ids=" ".join)
 def test_two_devices_learn_from_a_minibatch_what_one_does(more):
     """One seed: each device has half of the minibatch, and gradients are averaged."""
-    training = TrainingSession(config.load([*SHORT, *more, "seeds=1"]))
+    two = ["algo.policy_delay=2", "updates_per_collect=2"]  # the second sees the critics of the first
+    training = TrainingSession(config.load([*SHORT, *more, *two, "seeds=1"]))
     assert training.trainer.sharding.minibatch_axis is not None
     alone = TrainLoop(training.env, training.layout, training.trainer.schedule,
                       {team: algo.hyper_params() for team, algo in training.config.teams().items()}, 1,
