@@ -23,27 +23,18 @@ from matd3_jax.training.schedule import Schedule
 pytestmark = pytest.mark.slow
 
 GAMMA = 0.8
-# The delay is in the first; a loop without it is half as long to compile.
 ALGORITHMS = {
     "matd3": Algorithm(hidden=(16,), clip="none"),
     "maddpg": Algorithm(hidden=(16,), clip="none", num_critics=1, policy_delay=1),
     "iddpg": Algorithm(hidden=(16,), clip="none", num_critics=1, policy_delay=1, critic="own"),
-    "matd3-layer-norm": Algorithm(hidden=(16,), clip="none", policy_delay=1, critic_norm="layer"),
+    "matd3-layer-norm": Algorithm(hidden=(16,), clip="none", critic_norm="layer"),
     "matd3-categorical": Algorithm(
-        hidden=(16,), clip="none", policy_delay=1, critic_head="categorical", critic_atoms=49, critic_range=(-6.0, 6.0)
+        hidden=(16,), clip="none", critic_head="categorical", critic_atoms=49, critic_range=(-6.0, 6.0)
     ),
     "matd3-quantile": Algorithm(
-        hidden=(16,),
-        clip="none",
-        policy_delay=1,
-        critic_head="quantile",
-        critic_quantiles=9,
-        dropped_quantiles=0,
-        actor_critics="all",
+        hidden=(16,), clip="none", critic_head="quantile", critic_quantiles=9, dropped_quantiles=0, actor_critics="all"
     ),
-    "matd3-subset": Algorithm(
-        hidden=(16,), clip="none", policy_delay=1, num_critics=4, target_critics=2, actor_critics="all"
-    ),
+    "matd3-subset": Algorithm(hidden=(16,), clip="none", num_critics=4, target_critics=2, actor_critics="all"),
 }
 HYPER = HYPER._replace(
     gamma=GAMMA,
