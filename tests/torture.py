@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).parent / "helpers"))
 
 import faults  # noqa: E402
 import numpy as np  # noqa: E402
-from checkpoint_arrays import leaves  # noqa: E402
+from checkpoint_arrays import assert_same_arrays, assert_same_run, leaves  # noqa: E402
 from disturbed import Ended, Job, Process  # noqa: E402
 
 from matd3_jax.runs.directory import RunDirectory  # noqa: E402
@@ -74,12 +74,7 @@ def same(path: Path, whole: Path) -> str:
     try:
         if (path / "metrics.csv").read_bytes() != (whole / "metrics.csv").read_bytes():
             return "metrics.csv differs"
-        found, wanted = leaves(path), arrays(whole)
-        if found.keys() != wanted.keys():
-            return "other arrays"
-        for name, value in wanted.items():
-            if not np.array_equal(found[name], value, equal_nan=True):
-                return f"{name} differs"
+        assert_same_arrays(leaves(path), arrays(whole))
         run = RunDirectory(path)
         left = [one.name for one in path.iterdir() if "partial" in one.name]
         left += [one.name for one in run.checkpoints.iterdir() if not one.name.isdigit()]
@@ -371,16 +366,8 @@ class Torture:
 
 def _same_member(path: Path, whole: Path) -> str:
     """Where a run of a sweep, whose checkpoint has no replay, differs from the unbroken one."""
-    import orbax.checkpoint as ocp
-
     try:
-        if (path / "metrics.csv").read_bytes() != (whole / "metrics.csv").read_bytes():
-            return f"{path.name}: metrics.csv differs"
-        with ocp.StandardCheckpointer() as reader:
-            states = [reader.restore(checkpoint.verify(run / "checkpoints") / "state") for run in (path, whole)]
-        for name, value in states[1].items():
-            if not np.array_equal(np.asarray(states[0][name]), np.asarray(value), equal_nan=True):
-                return f"{path.name}: {name} differs"
+        assert_same_run(path, whole)
         return "" if RunDirectory(path).summary() is not None else f"{path.name}: no summary"
     except Exception as error:
         return f"{path.name}: {type(error).__name__}: {error}"

@@ -31,7 +31,13 @@ SMALL = ("total_steps=100", "replay_capacity=100", "learning_starts=100", "batch
         ("seeds=2", "env=simple_speaker_listener", "algo=td3", "algo.hidden=[8,6,4]"),
         ("seeds=2", "update_order=random_sequential", "algo.policy_delay=1"),
         ("seeds=2", "env=simple_tag", "algo=m3matd3", "adversary=m3ddpg", "adversary.hidden=[5]"),
-        ("seeds=2", "algo.critic_norm=layer", "algo.critic_head=categorical", "algo.critic_range=[-50,0]"),
+        (
+            "seeds=2",
+            "algo.critic_norm=layer",
+            "algo.critic_head=categorical",
+            "algo.critic_range=[-50,0]",
+            "algo.policy_delay=1",
+        ),
         ("seeds=2", "algo.num_critics=5", "algo.target_critics=2", "algo.actor_critics=all"),
         ("seeds=2", "env=simple_tag", "algo.share_parameters=kind", "algo.policy_delay=1"),
         ("seeds=2", "env=simple_speaker_listener", "algo.critic=shared"),
@@ -39,6 +45,7 @@ SMALL = ("total_steps=100", "replay_capacity=100", "learning_starts=100", "batch
         (
             "seeds=2",
             "algo=m3matd3",
+            "algo.policy_delay=1",
             "algo.critic_head=quantile",
             "algo.critic_quantiles=6",
             "algo.num_critics=3",

@@ -18,7 +18,7 @@ written = pytest.fixture(pictures.written)
 STEPS = np.arange(0, 2001, 100)
 TINY = [
     "learning_starts=200", "algo.hidden=[4]", "batch_size=8", "eval_episodes=1", "num_envs=2", "replay_capacity=400",
-    "members=2", "populations=1", "steps=600", "only=simple_spread",
+    "members=2", "populations=1", "steps=600", "only=simple_spread", "algo.policy_delay=1",
 ]  # fmt: skip
 
 

@@ -369,8 +369,8 @@ def test_a_sweep_shares_the_seeds_of_each_batch(tmp_path, monkeypatch):
     of one seed, which the second process sits out. The same runs as in one process."""
     more = [*TINY, "eval_every=0", "total_steps=400", f"out={tmp_path}"]
     settings = {
-        name: config.load([*more, f"algo.lr={lr}", f"algo.policy_delay={delay}", f"seeds={seeds}"])
-        for name, lr, delay, seeds in (("a", 0.01, 1, 3), ("b", 0.1, 1, 1), ("c", 0.01, 2, 1))
+        name: config.load([*more, f"algo.lr={lr}", f"algo.hidden=[{units}]", f"seeds={seeds}"])
+        for name, lr, units, seeds in (("a", 0.01, 8, 3), ("b", 0.1, 8, 1), ("c", 0.01, 7, 1))
     }
     monkeypatch.setattr(runner.Stop, "__init__", lambda self: setattr(self, "signal", None))  # not in threads
     monkeypatch.setattr(ocp, "StandardCheckpointer", OneAtATime)
@@ -428,7 +428,8 @@ def test_a_hybrid_run_of_two_processes_is_that_of_one(tmp_path, monkeypatch):
     """By itself and in a sweep: each process hands over the networks and the replays of its own seeds."""
     monkeypatch.setattr(runner.Stop, "__init__", lambda self: setattr(self, "signal", None))  # not in threads
     monkeypatch.setattr(ocp, "StandardCheckpointer", OneAtATime)
-    small = [*TINY, "algo=hybrid", "eval_every=0", "checkpoint_every=0", "total_steps=600", "switch_at=300", "seeds=3"]
+    small = [*TINY, "algo=hybrid", "algo.policy_delay=1", "eval_every=0", "checkpoint_every=0", "total_steps=600",
+             "switch_at=300", "seeds=3"]  # fmt: skip
     settings = config.load(small)
 
     def work(processes):

@@ -125,7 +125,8 @@ def test_packing_takes_no_more_batches_than_needed():
     [
         ["seeds=6", "env=simple_spread", "algo.hidden=[64,64]", "batch_size=256"],
         ["seeds=2", "n_step=3", "diagnostics.q_bias=true", "normalize_observations=true"],
-        ["seeds=4", "algo.hidden=[256,256]", "batch_size=16", "on_divergence=stop_seed"],  # networks are kept besides
+        # Networks are kept besides.
+        ["seeds=4", "algo.hidden=[256,256]", "batch_size=16", "on_divergence=stop_seed", "algo.policy_delay=1"],
     ],
 )
 def test_the_computed_memory_covers_the_compiled_program(more):

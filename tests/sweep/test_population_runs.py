@@ -6,16 +6,15 @@ import signal
 from pathlib import Path
 
 import numpy as np
-import orbax.checkpoint as ocp
 import pictures
 import pytest
+from checkpoint_arrays import assert_same_run
 
 from matd3_jax.cli import check, evaluate, sweep
 from matd3_jax.figures import lineage as figure
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.sweep import lineage as lineages
 from matd3_jax.sweep.lineage import Lineage
-from matd3_jax.training import checkpoint
 from matd3_jax.training.copying import Copier
 from matd3_jax.training.session import TrainingSession
 
@@ -27,12 +26,6 @@ SWEPT = ["algo.lr=0.0001,0.001,0.01,0.1,1.0", "algo.gamma=0.9"]
 RATES = [0.0001, 0.001, 0.01, 0.1, 1.0]
 PBT = ["pbt=true", "pbt_every=100", "pbt_replay=true", "seeds=3", "seed=2"]
 SEEDS = (2, 3, 4)
-
-
-def leaves(run: Path) -> dict[str, np.ndarray]:
-    with ocp.StandardCheckpointer() as reader:
-        found = reader.restore(checkpoint.verify(run / "checkpoints") / "state")
-    return {name: np.asarray(leaf) for name, leaf in found.items()}
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
@@ -170,9 +163,7 @@ def test_stopped_and_resumed_it_is_the_same_sweep(trained, tmp_path, monkeypatch
     assert sweep.main([f"resume={cut}"]) == 0 and len(calls) == 11
     assert (cut / "pbt.csv").read_text() == (folder / "pbt.csv").read_text()
     for path in (folder / "runs").iterdir():
-        assert (cut / "runs" / path.name / "metrics.csv").read_text() == (path / "metrics.csv").read_text()
-        ours, theirs = leaves(cut / "runs" / path.name), leaves(path)
-        assert all(np.array_equal(ours[name], theirs[name]) for name in theirs)
+        assert_same_run(cut / "runs" / path.name, path)
     assert (cut / "table.csv").read_text() == (folder / "table.csv").read_text()
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pictures
 import pytest
+from checkpoint_arrays import assert_same_run, state_leaves
 
 from matd3_jax import config
 from matd3_jax.cli import sweep, train
@@ -20,7 +21,6 @@ from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.sweep import launcher, ranking, runner
 from matd3_jax.sweep.batch import Batch
 from matd3_jax.sweep.runner import Sweep
-from matd3_jax.training import checkpoint
 from matd3_jax.training.session import TrainingSession
 
 # Small enough to run in a second or two; both teams, an evaluation and the delay are there.
@@ -30,15 +30,6 @@ TINY = [
     "eval_episodes=3",
 ]  # fmt: skip
 SWEPT = ["algo.lr=0.01,0.1", "algo.tau=0.01,0.5"]
-
-
-def leaves(run: Path) -> dict[str, np.ndarray]:
-    """Every array but the replay of a run's last checkpoint."""
-    import orbax.checkpoint as ocp
-
-    with ocp.StandardCheckpointer() as reader:
-        found = reader.restore(checkpoint.verify(run / "checkpoints") / "state")
-    return {name: np.asarray(leaf) for name, leaf in found.items()}
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +53,7 @@ def test_each_member_equals_the_same_run_made_alone(swept, tmp_path):
     assert list(found) == list(alone)
     for name, values in alone.items():
         np.testing.assert_allclose(found[name], values, rtol=2e-5, atol=1e-5, err_msg=name)
-    ours, theirs = leaves(member), leaves(tmp_path / "alone")
+    ours, theirs = state_leaves(member), state_leaves(tmp_path / "alone")
     assert set(ours) == set(theirs)
     for name, values in theirs.items():
         np.testing.assert_allclose(ours[name], values, rtol=1e-4, atol=1e-5, err_msg=name)
@@ -79,7 +70,7 @@ def test_each_member_has_tensorboard_files_of_its_own(swept):
 
 
 def test_members_learn_with_their_own_numbers(swept):
-    actors = [leaves(path) for path in sorted((swept / "runs").iterdir())]
+    actors = [state_leaves(path) for path in sorted((swept / "runs").iterdir())]
     for k, one in enumerate(actors):
         for other in actors[:k]:
             assert any(not np.array_equal(one[name], other[name]) for name in one if "critic" in name)
@@ -160,10 +151,11 @@ def test_seeds_of_one_member_stop_and_the_others_go_on(swept, tmp_path):
     lost, sound = (tmp_path / "stops" / "runs" / f"lr_{lr}" for lr in ("1e+30", "0.01"))
     assert RunDirectory(sound).summary()["diverged"] == {}
     assert set(RunDirectory(lost).summary()["diverged"]) == {"0", "1"}
-    networks = {name: leaf for name, leaf in leaves(lost).items() if name.startswith(".groups")}
-    assert leaves(lost)[".stopped"].all() and all(np.isfinite(leaf).all() for leaf in networks.values())
-    there = leaves(sound)
-    for name, leaf in leaves(swept / "runs" / "lr_0.01-tau_0.01").items():  # another program, which rounds otherwise
+    networks = {name: leaf for name, leaf in state_leaves(lost).items() if name.startswith(".groups")}
+    assert state_leaves(lost)[".stopped"].all() and all(np.isfinite(leaf).all() for leaf in networks.values())
+    there = state_leaves(sound)
+    found = state_leaves(swept / "runs" / "lr_0.01-tau_0.01")
+    for name, leaf in found.items():  # another program, which rounds otherwise
         np.testing.assert_allclose(there[name], leaf, rtol=1e-3, atol=1e-5, err_msg=name)
 
 
@@ -197,9 +189,7 @@ def test_stopped_and_resumed_it_is_the_same_sweep(swept, tmp_path, monkeypatch, 
     assert not (tmp_path / "cut" / "table.csv").exists()
     assert sweep.main([f"resume={tmp_path / 'cut'}"]) == 0
     for path in (swept / "runs").iterdir():
-        assert (tmp_path / "cut" / "runs" / path.name / "metrics.csv").read_text() == (path / "metrics.csv").read_text()
-        ours, theirs = leaves(tmp_path / "cut" / "runs" / path.name), leaves(path)
-        assert all(np.array_equal(ours[name], theirs[name]) for name in theirs)
+        assert_same_run(tmp_path / "cut" / "runs" / path.name, path)
     assert not (tmp_path / "cut" / "batches" / "0").exists()  # its checkpoints, replays in them, are of no more use
 
 

@@ -14,7 +14,7 @@ TINY = [
     "env=simple_push", "algo.hidden=[4]", "batch_size=8", "num_envs=2", "learning_starts=100", "replay_capacity=200",
     "total_steps=400", "log_every=100", "eval_every=400", "eval_episodes=1", "seeds=5", "normalize_observations=true",
     "diagnostics.q_bias=true", "diagnostics.q_bias_rollouts=3", "diagnostics.q_bias_steps=2",
-    "on_divergence=stop_seed",
+    "on_divergence=stop_seed", "algo.policy_delay=1",
 ]  # fmt: skip
 
 

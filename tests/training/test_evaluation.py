@@ -23,7 +23,7 @@ SMALL = {
 
 
 def train(**options):
-    return matd3_jax.train("algo.hidden=[8]", env=Ledger(), **{**SMALL, **options})
+    return matd3_jax.train("algo.hidden=[8]", "algo.policy_delay=1", env=Ledger(), **{**SMALL, **options})
 
 
 @functools.cache
@@ -87,7 +87,7 @@ def test_episodes_by_hand():
 @pytest.mark.slow
 def test_deterministic_evaluations_play_the_averaged_actors():
     """With `actor_average` an evaluation is that of the averages, put in the actors' place; sampled ones are not."""
-    result = matd3_jax.train("algo.hidden=[8]", "algo.actor_average=0.2", env=Ledger(), **SMALL)
+    result = matd3_jax.train("algo.hidden=[8]", "algo.policy_delay=1", "algo.actor_average=0.2", env=Ledger(), **SMALL)
     state, training = result.state, result.training
     averages = tuple(g._replace(actor=g.actor_average) for g in state.groups)
     assert all(

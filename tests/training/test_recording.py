@@ -12,7 +12,7 @@ import threading
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from checkpoint_arrays import leaves
+from checkpoint_arrays import assert_same_run, back_to
 
 import matd3_jax
 from matd3_jax import config
@@ -53,21 +53,8 @@ def resume(path, **given):
 
 
 def same(path, whole):
-    assert (path / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
-    found, wanted = leaves(path), leaves(whole)
-    assert found.keys() == wanted.keys()
-    for name in wanted:
-        np.testing.assert_array_equal(found[name], wanted[name], err_msg=name)
+    assert_same_run(path, whole)
     assert RunDirectory(path).summary() is not None and (path / "learning_curve.png").exists()
-
-
-def back_to(path, step):
-    """As a kill after the checkpoint of `step` leaves it."""
-    for later in checkpoint.steps(path / "checkpoints"):
-        if later > step:
-            shutil.rmtree(path / "checkpoints" / str(later))
-    for name in ("summary.json", "learning_curve.png"):
-        (path / name).unlink(missing_ok=True)
 
 
 def test_there_is_a_checkpoint_right_after_the_warm_up(whole):

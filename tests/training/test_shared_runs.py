@@ -1,13 +1,12 @@
 """Runs whose agents share networks: resumed, swept, begun with, played against, exported, and what is refused."""
 
 import csv
-import shutil
 
 import jax
 import numpy as np
 import pytest
 import reference
-from checkpoint_arrays import leaves
+from checkpoint_arrays import assert_resumes_to_the_bit
 from cross_cases import OWN, SEED, SMALL, make, meet, runs
 from learner_cases import layers
 
@@ -27,6 +26,7 @@ from matd3_jax.training.session import TrainingSession
 TINY = [
     "env=simple_adversary", "seeds=2", "algo.hidden=[8]", "batch_size=16", "num_envs=2", "learning_starts=200",
     "replay_capacity=500", "total_steps=600", "log_every=100", "eval_every=300", "eval_episodes=2",
+    "algo.policy_delay=1",
 ]  # fmt: skip
 KIND, TEAM = "algo.share_parameters=kind", "algo.critic=shared"
 MODES = {"kind": [KIND], "team": [TEAM]}
@@ -57,16 +57,7 @@ def one_network(group, k, agents, seed, *critic):
 def test_resumed_to_the_bit(trained, tmp_path):
     """Metrics, Q-bias among them, and every number of the last checkpoint."""
     _, whole = trained
-    cut = shutil.copytree(whole, tmp_path / "cut")
-    first, *later = checkpoint.steps(cut / "checkpoints")
-    for step in later:
-        shutil.rmtree(cut / "checkpoints" / str(step))
-    assert train.main([f"resume={cut}", f"checkpoint={first}"]) == 0
-    assert (cut / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
-    found, want = leaves(cut), leaves(whole)
-    assert found.keys() == want.keys()
-    for name in want:
-        np.testing.assert_array_equal(found[name], want[name], err_msg=name)
+    assert_resumes_to_the_bit(whole, tmp_path / "cut")
 
 
 def test_what_its_metrics_say(trained):
@@ -279,7 +270,8 @@ def test_it_goes_with_other_settings(more):
 @pytest.mark.parametrize("more", [[KIND], [TEAM, KIND]], ids=" ".join)
 def test_two_devices_learn_from_a_minibatch_what_one_does(more):
     """One seed: each device has half of the minibatch, and gradients are averaged."""
-    training = TrainingSession(config.load([*SHORT, *more, "seeds=1"]))
+    two = ["algo.policy_delay=2", "updates_per_collect=2"]  # the second sees the critics of the first
+    training = TrainingSession(config.load([*SHORT, *more, *two, "seeds=1"]))
     assert training.trainer.sharding.minibatch_axis is not None
     alone = TrainLoop(training.env, training.layout, training.trainer.schedule,
                       {team: algo.hyper_params() for team, algo in training.config.teams().items()}, 1,
@@ -313,9 +305,4 @@ def test_a_team_of_several_kinds_with_one_set_of_critics(tmp_path):
     assert not any(name.startswith(".groups[1].critic") for name in given)
     saved = saved_policies.load(RunDirectory.open(path)[0], restored(path)[0], "best")
     assert all(np.isfinite(leaf).all() for group in saved.state.groups for leaf in group.actor.values())
-    cut = shutil.copytree(path, tmp_path / "cut")
-    first, *later = checkpoint.steps(cut / "checkpoints")
-    for step in later:
-        shutil.rmtree(cut / "checkpoints" / str(step))
-    assert train.main([f"resume={cut}", f"checkpoint={first}"]) == 0
-    assert (cut / "metrics.csv").read_bytes() == (path / "metrics.csv").read_bytes()
+    assert_resumes_to_the_bit(path, tmp_path / "cut")

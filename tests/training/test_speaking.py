@@ -32,7 +32,9 @@ CASES = ["soft", pytest.param("discrete", marks=pytest.mark.slow)]
 @functools.cache
 def trained(name):
     env, actions, options = RUNS[name]
-    return matd3_jax.train(f"env.actions={actions}", "algo.hidden=[8]", *options, env=env, **SMALL)
+    return matd3_jax.train(
+        f"env.actions={actions}", "algo.hidden=[8]", "algo.policy_delay=1", *options, env=env, **SMALL
+    )
 
 
 @pytest.mark.parametrize("name", CASES)
