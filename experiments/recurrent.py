@@ -112,8 +112,8 @@ STUDY = study.of_evaluations(
     name="recurrent",
     title="Recurrent networks",
     help=str(__doc__),
-    protocol="Ours, not the paper's: Cooperative Communication at the paper's settings, ten seeds, 1.5 million env steps, "
-    "and the half-cheetah with the fast recipe but for targets of one step, six seeds, a million env steps.",
+    protocol="Ours, not the paper's: Cooperative Communication at the paper's settings, ten seeds, 1.5 million env "
+    "steps, and the half-cheetah with the fast recipe but for targets of one step, six seeds, a million env steps.",
     settings=settings,
     keys=KEYS,
     claims=claims,

@@ -8,6 +8,7 @@ import pytest
 
 from matd3_jax import config, envs
 from matd3_jax.errors import UserError
+from matd3_jax.training import memory
 from matd3_jax.training.session import TrainingSession
 
 PAPER = {
@@ -203,6 +204,7 @@ MISTAKES = {
     "algo.hidden=[0]": "hidden",
     "algo.clip=global": "variable, network, none",
     "algo.critic=joint": "central, own",
+    "algo.actor=lstm": "mlp, gru",
     "algo.critic_norm=batch": "none, layer",
     "algo.critic_head=gaussian": "scalar, categorical, quantile",
     "algo.target_critics=3": "algo.num_critics=2",
@@ -280,7 +282,15 @@ def test_a_replay_that_cannot_fit_is_refused_with_the_arithmetic():
 def test_several_steps_need_one_number_more():
     one, three = (TrainingSession(config.load([f"n_step={n}", "total_steps=100000"])) for n in (1, 3))
     assert (one.layout.row_size, three.layout.row_size) == (127, 128)
-    assert "more" not in one.memory and "x 128 numbers" in three.memory and "rewards 3, more 1," in three.memory
+    said = [memory.of_replay(session.trainer, session.processes) for session in (one, three)]
+    assert "more" not in said[0] and "x 128 numbers" in said[1] and "rewards 3, more 1," in said[1]
+
+
+def test_recurrent_networks_need_their_states():
+    session = TrainingSession(config.load(["algo.actor=gru", "algo.gru_units=7", "total_steps=100000"]))
+    assert session.layout.row_size == 127 + 1 + 3 * 7
+    said = memory.of_replay(session.trainer, session.processes)
+    assert "x 149 numbers" in said and "rewards 3, more 1, states 21, x' 54" in said
 
 
 def test_a_short_run_allocates_no_rows_it_would_never_write():

@@ -24,6 +24,8 @@ OTHER = {  # another value of each setting of an algorithm
     "actor_output": "tanh",
     "target_noise": 0.3,
     "sync_targets": False,
+    "actor": "gru",
+    "gru_units": 9,
     "critic_norm": "layer",
     "critic_head": "categorical",
     "critic_atoms": 11,
