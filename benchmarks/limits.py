@@ -28,7 +28,7 @@ from matd3_jax import config
 from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option
 from matd3_jax.core import update
-from matd3_jax.core.agents import Group
+from matd3_jax.core.group import Group
 from matd3_jax.errors import UserError
 from matd3_jax.runtime import devices
 from matd3_jax.runtime.terminal import say

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from ledger import HYPER
 
-from matd3_jax.core import rollout, update
+from matd3_jax.core import acting, rollout, update
+from matd3_jax.core.acting import PolicyParams
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
-from matd3_jax.core.rollout import PolicyParams
 from matd3_jax.envs import make
 
 ENVS, LENGTH, EPISODE = 500, 12, 6
@@ -24,7 +24,7 @@ def fresh(layout):
 
 
 def started(env, layout, envs):
-    return jax.jit(lambda key: rollout.start(env, key, envs, rollout.ranged(layout)))(jax.random.key(1))
+    return jax.jit(lambda key: rollout.start(env, key, envs, acting.ranged(layout)))(jax.random.key(1))
 
 
 @pytest.fixture(scope="module")
@@ -108,8 +108,8 @@ def test_outside_of_collecting_the_noise_is_in_the_middle_of_the_range():
     middle = PolicyParams(actors, (HYPER._replace(exploration_noise=0.3),), None)
     ends = PolicyParams(actors, (HYPER._replace(exploration_noise=0.2, exploration_noise_high=0.4),), None)
     key = jax.random.key(3)
-    decide = jax.jit(rollout.decide, static_argnums=0)
-    one, other = decide(fixed, middle, observation, key), decide(ranged, ends, observation, key)
+    decide = jax.jit(acting.decide, static_argnums=0)
+    (one, _), (other, _) = decide(fixed, middle, observation, key), decide(ranged, ends, observation, key)
     for a, b in zip(one, other, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)  # float32
 
@@ -124,9 +124,9 @@ def test_mixed_teams_keep_their_own_noise():
     hyper = HYPER._replace(exploration_noise=0.2, exploration_noise_high=0.4)
     policy = PolicyParams(actors, (hyper,) * len(layout.groups), None)
     observation = [jnp.ones((5, size)) for size in env.observation_sizes]
-    draws = rollout._noise(layout, jax.random.key(1), (5,))
+    draws = acting.noise(layout, jax.random.key(1), (5,))
     quantile = jnp.full((5, layout.num_agents), 0.9)
-    act = jax.jit(rollout.act, static_argnums=0)
+    act = jax.jit(acting.act, static_argnums=0)
     got, want = act(layout, policy, observation, draws, quantile), act(plain, policy, observation, draws)
     for i, team in enumerate(layout.teams):
         same = np.array_equal(layout.action_part(got, i), layout.action_part(want, i))

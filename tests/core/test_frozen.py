@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from ledger import HYPER
 
-from matd3_jax.core import frozen, rollout, update
+from matd3_jax.core import acting, frozen, rollout, update
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.core.frozen import Scale
@@ -113,12 +113,12 @@ def test_it_plays_without_noise_whatever_the_others_do():
     env = make("simple_adversary")
     layout = JointLayout.of(env, {"agents": LEARNER, "adversaries": Algorithm(hidden=(5,), frozen=True)})
     groups = update.init(layout, jax.random.key(0))
-    policy = rollout.PolicyParams(
+    policy = acting.PolicyParams(
         tuple(g.actor for g in groups), (HYPER,) * 2, None, tuple(group.scale for group in groups)
     )
     observation = [jnp.ones((4, size)) for size in env.observation_sizes]
-    sampled = [rollout.decide(layout, policy, observation, jax.random.key(k)) for k in range(2)]
-    (still,) = (rollout.decide(layout, policy, observation, None),)
+    sampled = [acting.decide(layout, policy, observation, jax.random.key(k))[0] for k in range(2)]
+    still, _ = acting.decide(layout, policy, observation, None)
     assert (sampled[0][0] == sampled[1][0]).all() and (sampled[0][0] == still[0]).all()
     assert not (sampled[0][1] == sampled[1][1]).any()
     start = rollout.start(env, jax.random.key(1), 4)
@@ -126,6 +126,6 @@ def test_it_plays_without_noise_whatever_the_others_do():
         _, rows, _, _ = rollout.collect(env, layout, policy, start, jax.random.key(2), 3, random=random)
         parts = layout.row_parts(rows)
         seen = [layout.observation_part(parts.x, i) for i in range(3)]
-        done = rollout.decide(layout, policy, seen, None)
+        done, _ = acting.decide(layout, policy, seen, None)
         np.testing.assert_allclose(layout.action_part(parts.action, 0), done[0], atol=1e-6)
         assert np.abs(layout.action_part(parts.action, 1) - done[1]).max() > 0.01

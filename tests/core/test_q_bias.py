@@ -12,10 +12,10 @@ from learner_cases import layers
 from ledger import ENDS, HYPER, Ledger, LedgerState, by_hand
 
 from matd3_jax.core import q_bias, update
+from matd3_jax.core.acting import PolicyParams
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.core.q_bias import Pairs
-from matd3_jax.core.rollout import PolicyParams
 from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.envs import make
 from matd3_jax.envs.point_reach import PointState

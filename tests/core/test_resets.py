@@ -10,9 +10,9 @@ from ledger import HYPER
 
 from matd3_jax import envs
 from matd3_jax.core import rollout, update
+from matd3_jax.core.acting import PolicyParams
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
-from matd3_jax.core.rollout import PolicyParams
 from matd3_jax.envs.wrappers.joint_team import JointTeam
 
 SEEDS, ENVS, LENGTH = 2, 3, 40

@@ -14,7 +14,7 @@ import pytest
 
 from matd3_jax import config
 from matd3_jax.cli import command, train
-from matd3_jax.core import agents, rollout
+from matd3_jax.core import acting, agents
 from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.errors import UserError
 from matd3_jax.export import FORMATS, compare, export, numpy_file, onnx_file, saved_function, write
@@ -310,7 +310,6 @@ def test_decide_is_what_evaluations_play(run):
     seen = compare.observations(training, policy)
     assert seen.shape == (1000, training.layout.observation_size) and len(np.unique(seen, axis=0)) == 1000
     parts = [training.layout.observation_part(seen, i) for i in range(2)]
-    for one, other in zip(
-        compare.wanted(training, policy, seen), rollout.decide(training.layout, policy, parts, None), strict=True
-    ):
+    played, _ = acting.decide(training.layout, policy, parts, None)
+    for one, other in zip(compare.wanted(training, policy, seen), played, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-6)

@@ -12,7 +12,7 @@ from learner_cases import layers
 from ledger import ENDS, LIMIT, Ledger, by_hand
 
 import matd3_jax
-from matd3_jax.core import rollout
+from matd3_jax.core import acting, rollout
 from matd3_jax.training import session
 
 SEEDS, EPISODES, CHUNK = 3, 6, 48
@@ -99,7 +99,7 @@ def test_deterministic_evaluations_play_the_averaged_actors():
     got = training.evaluate(state, EPISODES, deterministic=True).episode_return
     np.testing.assert_array_equal(got, training.evaluate(swapped, EPISODES, deterministic=True).episode_return)
     np.testing.assert_array_equal(result.metrics["agent_0_eval_return"][:, -1], got[..., 0].mean(axis=1))
-    online = rollout.PolicyParams(tuple(g.actor for g in state.groups), still.hyper, still.statistics)
+    online = acting.PolicyParams(tuple(g.actor for g in state.groups), still.hyper, still.statistics)
     jax.tree.map(np.testing.assert_array_equal, still, online)
     sampled = [training.evaluate(s, EPISODES, deterministic=False).episode_return for s in (state, swapped)]
     assert (sampled[0] != sampled[1]).any()

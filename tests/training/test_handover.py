@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from matd3_jax import config, envs
-from matd3_jax.core import rollout
+from matd3_jax.core import acting
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.core.running_statistics import Statistics
@@ -95,9 +95,9 @@ def test_it_does_what_the_agents_do(pair, seen):
     mine, theirs = (s.trainer.policy(state, average=average) for s, state in ((here, one), (there, team)))
     for seed, row in enumerate([0, 1, 0]):
         take = jax.tree.map(lambda leaf, k=row: leaf[k], theirs)
-        wanted = rollout.act(there.layout, take, [jnp.asarray(o) for o in observation], None)
+        wanted = acting.act(there.layout, take, [jnp.asarray(o) for o in observation], None)
         take = jax.tree.map(lambda leaf, k=seed: leaf[k], mine)
-        found = rollout.act(here.layout, take, [jnp.asarray(full)], None)
+        found = acting.act(here.layout, take, [jnp.asarray(full)], None)
         np.testing.assert_allclose(found, wanted, atol=2e-6)
         assert np.std(wanted) > 1e-3
 

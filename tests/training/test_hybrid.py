@@ -12,7 +12,7 @@ from checkpoint_arrays import assert_same_run
 
 from matd3_jax import config
 from matd3_jax.cli import evaluate, sweep, train
-from matd3_jax.core import rollout
+from matd3_jax.core import acting
 from matd3_jax.errors import UserError
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.training import checkpoint, hybrid
@@ -79,7 +79,7 @@ def test_one_agent_does_what_the_agents_did(handed_over):
         mine, theirs = (s.trainer.policy(state, average=average) for s, state in ((one, after), (agents, before)))
         for seed in range(2):
             found, wanted = (
-                rollout.act(s.layout, jax.tree.map(lambda leaf, k=seed: leaf[k], policy), seen, None)
+                acting.act(s.layout, jax.tree.map(lambda leaf, k=seed: leaf[k], policy), seen, None)
                 for s, policy, seen in (
                     (one, mine, [np.concatenate(observation, axis=-1)]),
                     (agents, theirs, observation),

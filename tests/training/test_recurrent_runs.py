@@ -13,7 +13,7 @@ from learner_cases import layers
 
 from matd3_jax import config, envs
 from matd3_jax.cli import evaluate, export, sweep, train
-from matd3_jax.core import rollout
+from matd3_jax.core import acting
 from matd3_jax.errors import UserError
 from matd3_jax.evaluation import cross_play, trajectory
 from matd3_jax.training import checkpoint, starting
@@ -74,7 +74,7 @@ def test_states_follow_from_what_was_seen_and_done():
     policy = jax.tree.map(lambda leaf: leaf[1], trainer.policy(state))
     x, h = (jax.random.normal(jax.random.key(k), (3, size)) for k, size in ((0, layout.observation_size), (1, 10)))
     observation = [layout.observation_part(x, i) for i in range(3)]
-    actions, _ = rollout.decide(layout, policy, observation, None, h)
+    actions, _ = acting.decide(layout, policy, observation, None, h)
     params = layers(state.groups[g].actor, 1, 1)
     logits, _ = reference.forward(params, np.concatenate([observation[2], h[:, 5:]], axis=-1).astype(float))
     want = np.exp(logits) / np.exp(logits).sum(axis=-1, keepdims=True)

@@ -10,8 +10,9 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from matd3_jax.core import losses, optimizer
-from matd3_jax.core.agents import Group, JointLayout
+from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import HyperParams
+from matd3_jax.core.group import Group
 from matd3_jax.core.minibatch import Minibatch, Noise
 from matd3_jax.core.sharing import mean_gradient, network_of
 

@@ -7,7 +7,8 @@ import chex
 import jax.numpy as jnp
 
 from matd3_jax.core import networks
-from matd3_jax.core.agents import Group, JointLayout
+from matd3_jax.core.agents import JointLayout
+from matd3_jax.core.group import Group
 
 
 class Scale(NamedTuple):

@@ -14,8 +14,9 @@ import jax
 import jax.numpy as jnp
 
 from matd3_jax.core import gru
-from matd3_jax.core.agents import Group, JointLayout
+from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import HyperParams
+from matd3_jax.core.group import Group
 from matd3_jax.core.minibatch import Minibatch, Noise
 from matd3_jax.core.networks import apply
 

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from matd3_jax.core.agents import Group, JointLayout, RowParts
+from matd3_jax.core.agents import JointLayout, RowParts
+from matd3_jax.core.group import Group
 from matd3_jax.core.gru import History
 from matd3_jax.core.policies import Policy, flat_draw
 
@@ -108,7 +109,7 @@ def minibatch(
         action=action,
         inputs=parts.inputs if central else jnp.concatenate([observation, action], axis=-1),
         reward=part(layout.team_mean(parts.reward), place.agent, 1)[..., 0],
-        discount=parts.discount if layout.n_step == 1 else parts.discount * gamma**parts.more,
+        discount=parts.discount if layout.n_step == 1 or parts.more is None else parts.discount * gamma**parts.more,
         next_observations=every_next if central else (own_next,),
         next_x=parts.next_x if central else own_next,
         action_column=layout.observation_size + place.action if central else group.observation_size,
@@ -120,7 +121,7 @@ def minibatch(
 def _with_histories(layout: JointLayout, group: Group, batch: Minibatch, parts: RowParts, place: Place) -> Minibatch:
     """The minibatch of one member with what recurrent networks take of its sequences [sequences, steps]."""
     assert parts.more is not None and parts.state is not None
-    more = parts.more
+    more, first = parts.more, parts.state[:, 0]
 
     def cut(whole: chex.Array, start: chex.Array, size: int) -> chex.Array:
         return jax.lax.dynamic_slice_in_dim(whole, start, size, axis=-1)
@@ -132,7 +133,7 @@ def _with_histories(layout: JointLayout, group: Group, batch: Minibatch, parts: 
         for j in other.members:
             seen, done = layout.observation_part(parts.x, j), layout.action_part(parts.action, j)
             inputs.append(jnp.concatenate([seen, done], axis=-1))
-            start.append(layout.state_part(parts.state[:, 0], j))
+            start.append(layout.state_part(first, j))
         return History(jnp.stack(inputs), more, jnp.stack(start))
 
     own = None
@@ -140,7 +141,7 @@ def _with_histories(layout: JointLayout, group: Group, batch: Minibatch, parts: 
         observation = cut(parts.x, place.observation, group.observation_size)
         action = cut(parts.action, place.action, group.action_space.size)
         starts = np.cumsum([0, *layout.state_sizes[:-1]])
-        start = cut(parts.state[:, 0], jnp.asarray(starts)[place.agent], group.state_size)
+        start = cut(first, jnp.asarray(starts)[place.agent], group.state_size)
         own = History(jnp.concatenate([observation, action], axis=-1), more, start)
     central = group.algorithm.central
     critic = None if own is None else History(parts.inputs if central else own.inputs, more)

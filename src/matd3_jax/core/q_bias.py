@@ -12,9 +12,9 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from matd3_jax.core import rollout, running_statistics
+from matd3_jax.core import acting, running_statistics
+from matd3_jax.core.acting import PolicyParams
 from matd3_jax.core.agents import JointLayout
-from matd3_jax.core.rollout import PolicyParams
 from matd3_jax.envs.environment import Environment
 
 
@@ -132,9 +132,9 @@ def play_out(
     def step(carry, inputs):
         state, action, going, discount, total = carry
         draws, keys = inputs
-        after = jax.vmap(env.step)(keys, state, rollout.env_actions(layout, action))
+        after = jax.vmap(env.step)(keys, state, acting.env_actions(layout, action))
         total += jnp.where(going[:, None], discount * after.reward, 0)
-        action = rollout.act(layout, policy, after.observation, draws)
+        action = acting.act(layout, policy, after.observation, draws)
         return (after.state, action, going & ~after.terminated, discount * gamma, total), None
 
     carry = (

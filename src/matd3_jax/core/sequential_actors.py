@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from matd3_jax.core.agents import Group, JointLayout
+from matd3_jax.core.agents import JointLayout
+from matd3_jax.core.group import Group
 from matd3_jax.core.minibatch import Minibatch, Noise
 
 ORDER = 2**31 - 1

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from matd3_jax.errors import UserError
 
 if TYPE_CHECKING:
-    from matd3_jax.core.agents import Group
+    from matd3_jax.core.group import Group
 
 
 def network_of(params: chex.ArrayTree, k: chex.Array | int, agents: int) -> chex.ArrayTree:

@@ -10,9 +10,10 @@ import optax
 
 from matd3_jax.core import losses, minibatch, networks, optimizer, sequential_actors, team_critic
 from matd3_jax.core.agent_update import move_actor, update_agent, update_together
-from matd3_jax.core.agents import Group, JointLayout
+from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.frozen import Scale, unscaled
+from matd3_jax.core.group import Group
 from matd3_jax.core.minibatch import Minibatch, Place
 
 UNROLLED_MEMBERS = 4

@@ -12,10 +12,10 @@ import numpy as np
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
-from matd3_jax.core import rollout, sharing
+from matd3_jax.core import acting, rollout, sharing
+from matd3_jax.core.acting import PolicyParams
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
-from matd3_jax.core.rollout import PolicyParams
 from matd3_jax.core.running_statistics import Statistics
 from matd3_jax.envs.environment import Environment
 from matd3_jax.envs.wrappers.joint_team import JointTeam
@@ -61,14 +61,14 @@ class Side:
             recurrent: the states before, [envs, state_size].
         """
         if not isinstance(self.env, JointTeam):
-            actions, recurrent = rollout.decide(
+            actions, recurrent = acting.decide(
                 self.layout, policy, [observation[i] for i in self.members], key, recurrent
             )
             return list(actions), recurrent
         (agent,) = self.members
         seen = jax.vmap(self.env.join)(state, observation)[agent]
         everybody: list = [None] * len(self.env.agents)
-        (everybody[agent],), recurrent = rollout.decide(self.layout, policy, [seen], key, recurrent)
+        (everybody[agent],), recurrent = acting.decide(self.layout, policy, [seen], key, recurrent)
         parts = jax.vmap(self.env.split)(tuple(everybody))
         return [parts[i] for i in self.env.members], recurrent
 
@@ -176,7 +176,7 @@ def _program(env: Environment, sides: tuple[Side, ...], devices: tuple, episodes
                     actions[i] = action
             return tuple(actions), tuple(after)
 
-        fresh = tuple(rollout.fresh_state(side.layout, episodes) for side in sides)
+        fresh = tuple(acting.fresh_state(side.layout, episodes) for side in sides)
         return rollout.play(env, choose, key, episodes, fresh).episode_return
 
     each = jax.vmap(one, in_axes=(None, 0, None))

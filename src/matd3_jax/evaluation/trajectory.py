@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from matd3_jax.core import rollout
+from matd3_jax.core import acting
 from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import TrainState
 
@@ -138,14 +138,14 @@ def _episode(training: TrainingSession, number: int, deterministic: bool, steps:
             state, observation, recurrent = carry
             act_key, env_key = jax.random.split(key)
             seen, noise = [o[None] for o in observation], None if deterministic else act_key
-            chosen, recurrent = rollout.decide(layout, policy, seen, noise, recurrent)
+            chosen, recurrent = acting.decide(layout, policy, seen, noise, recurrent)
             actions = tuple(a[0] for a in chosen)
             after = env.step(jax.random.split(env_key, number + 1)[number], state, actions)
             kept = (keep(after.state), after.reward, after.terminated, after.truncated)
             return (after.state, after.observation, recurrent), kept
 
         keys = jax.random.split(step_key, env.episode_length)[:steps]
-        _, (later, *rest) = jax.lax.scan(step, (first, observation, rollout.fresh_state(layout, 1)), keys)
+        _, (later, *rest) = jax.lax.scan(step, (first, observation, acting.fresh_state(layout, 1)), keys)
         states = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), keep(first), later)
         return states, *rest
 

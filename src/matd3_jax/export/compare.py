@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from matd3_jax.core import rollout
-from matd3_jax.core.rollout import PolicyParams
+from matd3_jax.core import acting, rollout
+from matd3_jax.core.acting import PolicyParams
 from matd3_jax.envs.spaces import ActionSpace, Box, Discrete, Simplex
 from matd3_jax.errors import UserError
 from matd3_jax.training.session import TrainingSession
@@ -32,7 +32,7 @@ def observations(training: TrainingSession, policy: PolicyParams) -> np.ndarray:
 
     def play(policy: PolicyParams, key: Any) -> Any:
         start_key, key = jax.random.split(key)
-        start = rollout.start(env, start_key, ENVIRONMENTS, rollout.ranged(layout))
+        start = rollout.start(env, start_key, ENVIRONMENTS, acting.ranged(layout))
         return layout.row_parts(rollout.collect(env, layout, policy, start, key, played // ENVIRONMENTS)[1]).x
 
     seen = np.asarray(jax.jit(play)(jax.tree.map(jnp.asarray, policy), jax.random.key(0)), np.float32)
@@ -47,9 +47,7 @@ def wanted(training: TrainingSession, policy: PolicyParams, seen: np.ndarray) ->
     layout = training.layout
     parts = [layout.observation_part(jnp.asarray(seen), i) for i in range(layout.num_agents)]
     with jax.default_matmul_precision("highest"):
-        found, _ = jax.jit(lambda policy: rollout.decide(layout, policy, parts, None))(
-            jax.tree.map(jnp.asarray, policy)
-        )
+        found, _ = jax.jit(lambda policy: acting.decide(layout, policy, parts, None))(jax.tree.map(jnp.asarray, policy))
     return [np.asarray(action) for action in found]
 
 

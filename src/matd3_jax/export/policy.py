@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from matd3_jax.core import networks, running_statistics
+from matd3_jax.core.acting import PolicyParams
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.networks import StackedMLP
 from matd3_jax.core.policies import CategoricalPolicy, DeterministicPolicy
-from matd3_jax.core.rollout import PolicyParams
 from matd3_jax.core.running_statistics import CLIP, LEAST_VARIANCE, Statistics
 from matd3_jax.envs.spaces import ActionSpace, Box, Simplex
 from matd3_jax.errors import UserError

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from matd3_jax.core.rollout import PolicyParams
+from matd3_jax.core.acting import PolicyParams
 from matd3_jax.errors import UserError
 from matd3_jax.export import compare, describe, numpy_file, onnx_file, saved_function
 from matd3_jax.export.policy import function, perceptron

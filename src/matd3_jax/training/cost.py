@@ -13,7 +13,8 @@ from jax.sharding import NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from matd3_jax.core import gru, update
-from matd3_jax.core.agents import Group, JointLayout
+from matd3_jax.core.agents import JointLayout
+from matd3_jax.core.group import Group
 from matd3_jax.envs.environment import Environment
 from matd3_jax.training.schedule import Schedule
 from matd3_jax.training.session import TrainingSession

@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
-from matd3_jax.core import q_bias, replay, rollout, running_statistics, update
+from matd3_jax.core import acting, q_bias, replay, rollout, running_statistics, update
+from matd3_jax.core.acting import PolicyParams
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.q_bias import Pairs
-from matd3_jax.core.rollout import EnvState, Episodes, PolicyParams
+from matd3_jax.core.rollout import EnvState, Episodes
 from matd3_jax.envs.environment import Environment
 from matd3_jax.training import stopping
 from matd3_jax.training.learner import Learner
@@ -139,7 +140,7 @@ class TrainLoop:
 
         def one(key):
             apart = jax.random.fold_in(key, rollout.APART)
-            ranged = rollout.ranged(self.layout)
+            ranged = acting.ranged(self.layout)
             return rollout.start(self.env, apart, self.schedule.num_envs, ranged, self.layout.state_size)
 
         start = jax.jit(self.sharding.sharded(jax.vmap(one), P("seeds"), P("seeds")))

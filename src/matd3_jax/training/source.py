@@ -12,8 +12,9 @@ from matd3_jax import envs
 from matd3_jax.config import Config
 from matd3_jax.config.schema import AlgoConfig
 from matd3_jax.core import sharing
-from matd3_jax.core.agents import Group, JointLayout
+from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.frozen import Scale
+from matd3_jax.core.group import Group
 from matd3_jax.core.running_statistics import CLIP, LEAST_VARIANCE, Statistics
 from matd3_jax.core.update import GroupState
 from matd3_jax.envs.environment import Environment

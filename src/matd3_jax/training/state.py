@@ -6,7 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from matd3_jax.core import q_bias, rollout, running_statistics, update
+from matd3_jax.core import acting, q_bias, rollout, running_statistics, update
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.q_bias import Reservoir
 from matd3_jax.core.rollout import EnvState, Episodes
@@ -76,7 +76,7 @@ def initial(
     def one(key):
         network_key, env_key, key = jax.random.split(key, 3)
         networks = update.init(layout, network_key)
-        return networks, rollout.start(env, env_key, num_envs, rollout.ranged(layout), layout.state_size), key
+        return networks, rollout.start(env, env_key, num_envs, acting.ranged(layout), layout.state_size), key
 
     groups, envs, keys = jax.vmap(one)(keys)
     state = TrainState(groups, envs, jnp.zeros((keys.shape[0], 0, 0)), keys, jnp.int32(0))
