@@ -56,6 +56,7 @@ SHORT: dict[str, tuple[str, ...]] = {
     "grid_search": ("lr 0.01, batch 1000, d 2 work best",),
     "ant": (
         "Ant: MATD3 better than MADDPG",
+        "Ant: MATD3 better than IL-TD3",
         "Ant: IL-TD3 fails",
         "Ant: single-agent TD3 ends best",
         "Ant: ... and is slower at first",

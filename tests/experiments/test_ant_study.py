@@ -8,6 +8,7 @@ import pictures
 import pytest
 
 from experiments import ant
+from experiments.tidy import Table
 from matd3_jax import config
 from matd3_jax.errors import UserError
 from matd3_jax.runs.directory import RunDirectory
@@ -56,7 +57,7 @@ def test_report(runs, tmp_path, monkeypatch):
     assert "| SA-TD3 | 2 | 40 | 580 ± 57 (72 to 1088) | 580 | 5.80 |" in table
     assert "| IL-TD3 |" not in table and "Not yet run: iltd3" in table
     # Of two algorithms only one is finished: nothing is claimed.
-    assert table.count("**not yet run**") == 4
+    assert table.count("**not yet run**") == 5
     facts = json.loads((out / "runs.json").read_text())
     assert facts["matd3"]["summary"] == "not finished"
     assert facts["td3"]["summary"] == {"total_steps": 40}
@@ -80,6 +81,26 @@ def test_report(runs, tmp_path, monkeypatch):
     np.testing.assert_array_equal(returns.lines[2].get_ydata(), [1000, 1000])
     assert figures[out / "curves.png"].get_suptitle() == "ant: mean ± sd over seeds"
     assert {matd3, td3} <= pictures.colors(out / "curves.png")
+
+
+def test_failing_is_no_better_than_standing_still():
+    """What walks does not fail, however much less it is than what MATD3 gets; and there is one height to stand at."""
+
+    def verdicts(iltd3, env="ant"):
+        rows = [
+            {"env": env, "algo": algo, "seed": seed, "step": step, "eval_return_agents": level + 10 * seed}
+            for algo, level in {"matd3": 3000.0, "iltd3": iltd3}.items()
+            for seed in range(4)
+            for step in (0, 100)
+        ]
+        table = Table({name: np.array([row[name] for row in rows]) for name in rows[0]})
+        return [claim.verdict for claim in ant.claims(table)[1:3]]
+
+    assert verdicts(2500.0) == ["same", "opposite"] and verdicts(900.0) == ["same", "same"]
+    assert verdicts(990.0)[1] == "not shown" and verdicts(2500.0, env="half_cheetah") == ["same", "not yet run"]
+    claim = ant.failing("x", np.array([990.0, 1010.0, 1020.0]))
+    assert claim.found == "IL-TD3 1,007 (n = 3), 2 of 3 better than standing still"
+    assert claim.difference.estimate == pytest.approx(-20 / 3)
 
 
 def test_bad_input_is_named(tmp_path):
