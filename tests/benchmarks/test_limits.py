@@ -9,6 +9,7 @@ import pytest
 
 from benchmarks import limits
 from matd3_jax import config
+from matd3_jax.errors import UserError
 from matd3_jax.training.session import TrainingSession
 
 SMALL = ("total_steps=100", "replay_capacity=100", "learning_starts=100", "batch_size=16", "algo.hidden=[8,6]")
@@ -94,3 +95,9 @@ def test_a_product_is_timed_by_itself():
     np.testing.assert_allclose(jnp.einsum(small.equation, x, w), x @ w, rtol=1e-4, atol=1e-4)
     assert limits.seconds(large, 1, 3) > 8 * limits.seconds(small, 1, 3)
     assert math.isfinite(limits.seconds(small, 2, 1))
+
+
+def test_recurrent_networks_are_not_counted_product_by_product():
+    trainer = TrainingSession(config.load([*SMALL, "seeds=2", "algo.actor=gru"])).trainer
+    with pytest.raises(UserError, match=r"^actor=gru: the products of perceptrons alone"):
+        limits.products(trainer)
