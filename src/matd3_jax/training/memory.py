@@ -157,8 +157,8 @@ def update_bytes(trainer: TrainLoop) -> int:
     steps = (layout.burn_in + layout.sequence_length) / layout.sequence_length
     rows = steps * layout.num_minibatches * layout.row_size  # gathered for all agents at once
     # The gates of one agent's critics and of everybody's actors, and what their gradients need of each step.
-    gates = 12 * steps * max(g.algorithm.num_critics * g.state_size for g in layout.learning_groups)
-    gates += 12 * steps * layout.state_size
+    gates = 16 * steps * max(g.algorithm.num_critics * g.state_size for g in layout.learning_groups)
+    gates += 16 * steps * layout.state_size
     noise = layout.num_agents * 3 * layout.action_size
     return int(4 * schedule.batch_size * (2 * rows + noise + agents * (4 * widest + gates)))
 
