@@ -28,11 +28,12 @@ def example():
     "lines", [["env.split=halves"], ["algo=td3", "env.split=2x4"], ["env.velocities=false"]], ids=str
 )
 def test_an_episode_has_the_return_of_our_own_evaluation(example, lines, tmp_path):
-    """From the same start: the first 20 env steps to 1e-3 by themselves, all 100 to 1e-4 on our episode's states.
+    """From the same start: the first 20 env steps to 1e-3 by themselves, all to 1e-4 on our episode's states.
 
     Our state is kept in float32 between env steps, and so is gymnasium's here; what is left apart are sums in another
     order, 1e-8 m after the first step. Contacts make that half as large again with every step: after 100 steps two
     episodes are two different ones, so that gymnasium's robot is put back on our states, from which it is 1e-5 m away.
+    When it falls, if it does within 100 env steps, depends on the processor for the same reason.
     """
     small = ["seeds=1", "algo.hidden=[16,16]", "env.episode_length=100", "env.physics=c", "total_steps=20000"]
     training = TrainingSession(config.load(["env=ant", "normalize_observations=true", *lines, *small]))
@@ -43,7 +44,7 @@ def test_an_episode_has_the_return_of_our_own_evaluation(example, lines, tmp_pat
     policies, facts = example.load(tmp_path / "policies")
     played = trajectory.play(training, state, keep=lambda robot: (robot.qpos, robot.qvel, robot.qacc_warmstart))
     states, returns = [np.asarray(part, np.float64) for part in played.states], played.returns["agents"]
-    assert played.length == 100
+    assert played.length > 50
     env, start, after = example.make(), (states[0][0], states[1][0]), []
 
     def rounded(data):
@@ -59,7 +60,8 @@ def test_an_episode_has_the_return_of_our_own_evaluation(example, lines, tmp_pat
     found = example.episode(env, policies, alone, seed=0, start=start, after_step=rounded)
     assert found == pytest.approx(returns[20], rel=1e-3)
     found = example.episode(env, policies, facts, seed=0, start=start, after_step=put_back)
-    assert found == pytest.approx(returns[100], rel=1e-4) and max(after) < 1e-5
+    assert found == pytest.approx(returns[-1], rel=1e-4) and max(after) < 1e-5
+    assert len(after) == played.length
 
 
 @pytest.mark.slow
