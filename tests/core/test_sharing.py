@@ -11,7 +11,7 @@ import pytest
 import sharing_reference
 from learner_cases import BATCH, DISTRIBUTION, QUANTILES, Case, adam, drawn, layers, random_rows, random_state
 
-from matd3_jax.core import agents, losses, networks, sequential_actors, sharing, update
+from matd3_jax.core import losses, networks, sequential_actors, sharing, update
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import Algorithm
 from matd3_jax.envs import Box, Simplex
@@ -222,7 +222,7 @@ def test_agents_that_see_the_same_can_act_differently():
     found = np.asarray(group.outputs(state.actor, seen))
     assert min(np.abs(found[a] - found[b]).max() for a, b in ((0, 1), (0, 2), (1, 2))) > 1e-3
     index = jnp.broadcast_to(jnp.eye(3)[:, None], (3, 4, 3))
-    literal = agents.apply(group.actor, jax.tree.map(lambda leaf: leaf[0], state.actor),
+    literal = networks.apply(group.actor, jax.tree.map(lambda leaf: leaf[0], state.actor),
                            jnp.concatenate([seen, index], axis=-1).reshape(12, 21))  # fmt: skip
     np.testing.assert_allclose(found.reshape(12, 5), literal, rtol=1e-5, atol=1e-6)
     inputs = jax.random.normal(KEY, (4, layout.observation_size + layout.action_size))

@@ -125,7 +125,7 @@ def test_packing_takes_no_more_batches_than_needed():
     [
         ["seeds=6", "env=simple_spread", "algo.hidden=[64,64]", "batch_size=256"],
         ["seeds=2", "n_step=3", "diagnostics.q_bias=true", "normalize_observations=true"],
-        ["seeds=2", "env=simple_spread", "algo.actor=gru", "algo.hidden=[64,64]", "algo.gru_units=64", "batch_size=256"],
+        ["seeds=2", "env=simple_spread", "algo.actor=gru", "algo.hidden=[64,64]", "batch_size=256"],
         # Networks are kept besides.
         ["seeds=4", "algo.hidden=[256,256]", "batch_size=16", "on_divergence=stop_seed", "algo.policy_delay=1"],
     ],
