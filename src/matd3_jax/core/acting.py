@@ -50,7 +50,7 @@ def decide(
     """
     draws = None if key is None else noise(layout, key, observation[0].shape[:1])
     action = act(layout, policy, observation, draws, recurrent=recurrent)
-    return env_actions(layout, action), remember(layout, policy, observation, action, recurrent)
+    return env_actions(layout, action), next_state(layout, policy, observation, action, recurrent)
 
 
 def fresh_state(layout: JointLayout, envs: int) -> chex.Array | None:
@@ -103,7 +103,7 @@ def act(
     return layout.join_actions(parts)
 
 
-def remember(
+def next_state(
     layout: JointLayout,
     policy: PolicyParams,
     observation: Sequence[chex.Array],

@@ -94,7 +94,7 @@ def collect(
         before = carry.state if keep_states else None
         quantile = 0.5 if carry.noise_quantile is None else carry.noise_quantile
         action = acting.act(layout, policy, carry.observation, draws, quantile, random, carry.recurrent)
-        recurrent = acting.remember(layout, policy, carry.observation, action, carry.recurrent)
+        recurrent = acting.next_state(layout, policy, carry.observation, action, carry.recurrent)
         done = acting.env_actions(layout, action)
         if on_demand:
             after, *fresh = jax.vmap(env.step_or_reset)(step_keys, fresh, carry.state, done)

@@ -138,8 +138,8 @@ def update(
             number = place.agent if own_minibatches else jnp.array(layout.minibatches)[place.agent]
             return jax.lax.dynamic_index_in_dim(whole, number, keepdims=False)
 
-        others, remembered = jax.tree.map(own, (frozen_next, sequences))
-        return minibatch.minibatch(layout, layout.groups[g], own(rows), place, hyper[g].gamma, others, remembered)
+        others, histories = jax.tree.map(own, (frozen_next, sequences))
+        return minibatch.minibatch(layout, layout.groups[g], own(rows), place, hyper[g].gamma, others, histories)
 
     def minibatches(g: int) -> Place | Minibatch:
         """Of all members, stacked; one by one each is cut out in its turn, as all N together hold N times N parts."""

@@ -32,7 +32,7 @@ compiling MJX."""
 
 def acting_flops(layout: JointLayout) -> float:
     """Floating point operations of the policies' matrix products in one env step of one seed."""
-    return 2.0 * sum(len(group.members) * (_forward(_actor(group)) + _remembering(group)) for group in layout.groups)
+    return 2.0 * sum(len(group.members) * (_forward(_actor(group)) + _state_products(group)) for group in layout.groups)
 
 
 def update_flops(layout: JointLayout, schedule: Schedule) -> float:
@@ -64,10 +64,10 @@ def _member(layout: JointLayout, schedule: Schedule, group: Group) -> tuple[floa
     actor, critic = _actor(group), (inputs + group.state_size, *group.algorithm.hidden, group.critic.num_outputs)
     # Steps that a state is brought forward for each transition that is learned from.
     steps = (layout.burn_in + layout.sequence_length) / layout.sequence_length
-    target_actions = _forward(actor) + steps * _remembering(group)
+    target_actions = _forward(actor) + steps * _state_products(group)
     if algorithm.central:
         target_actions = sum(
-            len(other.members) * (_forward(_actor(other)) + steps * _remembering(other)) for other in layout.groups
+            len(other.members) * (_forward(_actor(other)) + steps * _state_products(other)) for other in layout.groups
         )
         if schedule.shared_minibatch and not schedule.sequential and not group.team_critic:
             target_actions /= len(group.members)
@@ -75,21 +75,17 @@ def _member(layout: JointLayout, schedule: Schedule, group: Group) -> tuple[floa
     # The targets' values; the critics' own, and their gradients.
     critics = targets * _forward(critic) + algorithm.num_critics * (2 * _forward(critic) + _inputs(critic))
     if group.recurrent:
-        remembered, forgotten = (
-            steps * gru.multiplications(inputs, group.state_size),
-            gru.slopes(inputs, group.state_size),
-        )
-        critics += targets * remembered + algorithm.num_critics * (remembered + forgotten)
-        critics += (
-            algorithm.num_critics * critic[0] * critic[1]
-        )  # back to the first layer's inputs, of which states are a part
+        states = steps * gru.multiplications(inputs, group.state_size)
+        critics += targets * states + algorithm.num_critics * (states + gru.slopes(inputs, group.state_size))
+        # Back to the first layer's inputs, of which states are a part.
+        critics += algorithm.num_critics * critic[0] * critic[1]
     # Where others' actions are moved: values at the actions as they are, and back to the first layer's inputs.
     slopes = (_forward(critic) + _inputs(critic) + critic[0] * critic[1]) if algorithm.adversarial else 0
     # Through a critic back to the own action: its part of the first layer's inputs, once each way.
     through = _forward(critic) + _inputs(critic) + 2 * size * critic[1]
     actors = 2 * _forward(actor) + _inputs(actor) + climbed * (through + slopes)
     if group.recurrent:
-        actors += climbed * remembered + steps * _remembering(group) + actor[0] * actor[1]
+        actors += climbed * states + steps * _state_products(group) + actor[0] * actor[1]
         actors += gru.slopes(group.observation_size + size, group.state_size)
     if algorithm.adversarial and algorithm.critic_head != "categorical":
         actors -= climbed * critic[-2] * critic[-1]  # the slope of a mean needs no outputs
@@ -106,7 +102,7 @@ def _actor(group: Group) -> tuple[int, ...]:
     return group.observation_size + group.state_size, *group.algorithm.hidden, group.action_space.size
 
 
-def _remembering(group: Group) -> float:
+def _state_products(group: Group) -> float:
     """Multiplications of an actor's state for each step."""
     if not group.recurrent:
         return 0
