@@ -1,10 +1,12 @@
 """Deterministic evaluations along training: curves, bands and rows of tables, for the studies of robots."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 
+from experiments import figures
 from experiments.tidy import Table
 from matd3_jax.figures import style
 from matd3_jax.stats.intervals import Estimate, t_interval
@@ -66,3 +68,24 @@ def row(part: Table) -> list[str]:
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Lines of a Markdown table."""
     return [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows)]
+
+
+# ---- of several settings by name, in one task ------------------------------------------------------------------------
+
+
+def draw_each(parts: Mapping[str, Table], title: str, path: Path) -> None:
+    """Write the figure of the curves of all settings that have been run."""
+    figure, (axis,) = figures.canvas(1, width=6.4, height=4.2)
+    for k, (name, part) in enumerate(parts.items()):
+        if late(part) is not None:
+            draw(axis, part, RETURN, style.SERIES[k], name)
+    axis.set_title(title)
+    axis.legend(frameon=False, loc="best")
+    figures.save(figure, path)
+
+
+def details_of_each(what: str, quantity: str, parts: Mapping[str, Table]) -> list[str]:
+    """The table of all settings that have been run: `quantity`, and the last returns."""
+    found = {name: part for name, part in parts.items() if late(part) is not None}
+    rows = [[name, figures.interval(late(part)), *row(part)[:-1]] for name, part in found.items()]
+    return table((what, quantity, *HEAD[:-1]), rows)

@@ -13,7 +13,6 @@ from experiments.study import StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
-from matd3_jax.figures.style import SERIES
 
 SILENT, SPEAKING = "env.speaking_steps=2", "env.speaking_steps=25"
 WAYS: dict[str, list[str]] = {
@@ -48,24 +47,18 @@ def claims(table: Table) -> list[Claim]:
     return [verdict.compare(text, QUANTITY, *pair)]
 
 
+def parts(table: Table) -> dict[str, Table]:
+    return {way: part(table, way) for way in WAYS}
+
+
 def draw(table: Table, path: Path) -> None:
-    figure, (axis,) = figures.canvas(1, width=6.4, height=4.2)
-    for k, way in enumerate(WAYS):
-        rows = part(table, way)
-        if evaluations.late(rows) is not None:
-            evaluations.draw(axis, rows, evaluations.RETURN, SERIES[k], way)
-    axis.set_title(f"{figures.task('simple_speaker_listener')}, the speaker silent after two steps", fontsize=10)
-    axis.legend(frameon=False, loc="best")
-    figures.save(figure, path)
+    evaluations.draw_each(
+        parts(table), f"{figures.task('simple_speaker_listener')}, the speaker silent after two steps", path
+    )
 
 
 def details(table: Table) -> list[str]:
-    rows = []
-    for way in WAYS:
-        found = part(table, way)
-        if evaluations.late(found) is not None:
-            rows.append([way, figures.interval(evaluations.late(found)), *evaluations.row(found)[:-1]])
-    return evaluations.table(("networks", QUANTITY, *evaluations.HEAD[:-1]), rows)
+    return evaluations.details_of_each("networks", QUANTITY, parts(table))
 
 
 STUDY = study.of_evaluations(

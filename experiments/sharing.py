@@ -15,7 +15,6 @@ from experiments.study import StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
 from matd3_jax.cli import command
-from matd3_jax.figures.style import SERIES
 
 MODES: dict[str, list[str]] = {
     "apart": [],
@@ -58,24 +57,16 @@ def claims(table: Table) -> list[Claim]:
     return against_base(found, BASE, same)
 
 
+def parts(table: Table) -> dict[str, Table]:
+    return {name: part(table, name) for name in MODES}
+
+
 def draw(table: Table, path: Path) -> None:
-    figure, (axis,) = figures.canvas(1, width=6.4, height=4.2)
-    for k, name in enumerate(MODES):
-        rows = part(table, name)
-        if evaluations.late(rows) is not None:
-            evaluations.draw(axis, rows, evaluations.RETURN, SERIES[k], name)
-    axis.set_title(figures.task("simple_spread"))
-    axis.legend(frameon=False, loc="best")
-    figures.save(figure, path)
+    evaluations.draw_each(parts(table), figures.task("simple_spread"), path)
 
 
 def details(table: Table) -> list[str]:
-    rows = []
-    for name in MODES:
-        found = part(table, name)
-        if evaluations.late(found) is not None:
-            rows.append([name, figures.interval(evaluations.late(found)), *evaluations.row(found)[:-1]])
-    return evaluations.table(("networks", QUANTITY, *evaluations.HEAD[:-1]), rows)
+    return evaluations.details_of_each("networks", QUANTITY, parts(table))
 
 
 STUDY = study.of_evaluations(

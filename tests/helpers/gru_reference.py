@@ -1,4 +1,4 @@
-"""Gated recurrent units in NumPy of float64, written anew."""
+"""Gated recurrent units in NumPy of float64, written by themselves."""
 
 import numpy as np
 

@@ -17,6 +17,7 @@ from matd3_jax.core import gru
 from matd3_jax.core.agents import JointLayout
 from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.group import Group
+from matd3_jax.core.gru import History
 from matd3_jax.core.minibatch import Minibatch, Noise
 from matd3_jax.core.networks import apply
 
@@ -45,9 +46,7 @@ def td_target(
     critic = group.target_critic
     if chosen is not None:
         critic_target = jax.tree.map(lambda leaf: leaf[chosen], critic_target)
-    if batch.critic_history is not None:
-        _, after = gru.states(critic_target[gru.PARAMS], batch.critic_history, layout.burn_in)
-        next_inputs = gru.beside(next_inputs, after)
+    next_inputs = with_states(layout, critic_target, next_inputs, batch.critic_history, after=True)
     if group.algorithm.adversarial:
         least = partial(critic.target_value, critic_target)
         next_inputs = worst_case(layout, hyper, least, next_inputs, batch.action_column)
@@ -76,8 +75,7 @@ def target_actions(
             parts.append(batch.frozen_next[j])
             continue
         seen, history = batch.next_observations[j], batch.histories[j] if batch.histories else None
-        if history is not None:
-            seen = gru.beside(seen, gru.states(params[gru.PARAMS], history, layout.burn_in)[1])
+        seen = with_states(layout, params, seen, history, after=True)
         output = other.outputs(params, seen) if central else apply(group.actor, params, seen)
         part = other.policy.sample(output, noise.target[j])
         draw = noise.smoothing[j]
@@ -108,10 +106,7 @@ def actor_loss(
     """-mean Q_i1(x, a_1, ..., mu_i(o_i), ..., a_N) + regularizer * mean mu_i's output^2, the others' actions from the
     replay, adversarial: moved against Q_i1 there; twice, as value and as metric. Q_i1: or the mean over the critics
     (`actor_critics`)."""
-    seen = batch.observation
-    if batch.history is not None:
-        seen = gru.beside(seen, gru.states(params[gru.PARAMS], batch.history, layout.burn_in)[0])
-    output = apply(group.actor, params, seen)
+    output = apply(group.actor, params, with_states(layout, params, batch.observation, batch.history))
     action = group.policy.sample(output, noise.action)
     if batch.critic_history is not None:  # states of those critics alone
         critic = jax.tree.map(lambda leaf: leaf[: group.algorithm.critics_climbed], critic)
@@ -130,10 +125,17 @@ def actor_loss(
 def critic_inputs(layout: JointLayout, params: chex.ArrayTree, batch: Minibatch) -> chex.Array:
     """What critics with these parameters read of a minibatch: [batch, inputs], or [critics, batch, inputs] where each
     has states of its own."""
-    if batch.critic_history is None:
-        return batch.inputs
-    before, _ = gru.states(params[gru.PARAMS], batch.critic_history, layout.burn_in)
-    return gru.beside(batch.inputs, before)
+    return with_states(layout, params, batch.inputs, batch.critic_history)
+
+
+def with_states(
+    layout: JointLayout, params: chex.ArrayTree, inputs: chex.Array, history: History | None, after: bool = False
+) -> chex.Array:
+    """`inputs` [..., batch, inputs] with the states of the network with these parameters beside them, those before each
+    step or after it; as they are without a history."""
+    if history is None:
+        return inputs
+    return gru.beside(inputs, gru.states(params[gru.PARAMS], history, layout.burn_in)[after])
 
 
 def worst_case(

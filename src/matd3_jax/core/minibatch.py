@@ -93,13 +93,9 @@ def minibatch(
     """
     central = group.algorithm.central
     parts = layout.row_parts(rows)
-
-    def part(whole: chex.Array, start: chex.Array, size: int) -> chex.Array:
-        return jax.lax.dynamic_slice_in_dim(whole, start, size, axis=-1)
-
-    observation = part(parts.x, place.observation, group.observation_size)
-    action = part(parts.action, place.action, group.action_space.size)
-    own_next = part(parts.next_x, place.observation, group.observation_size)
+    observation = _entries(parts.x, place.observation, group.observation_size)
+    action = _entries(parts.action, place.action, group.action_space.size)
+    own_next = _entries(parts.next_x, place.observation, group.observation_size)
     every_next = tuple(
         None if other.frozen else jnp.stack([layout.observation_part(parts.next_x, j) for j in other.members])
         for other in layout.groups
@@ -108,7 +104,7 @@ def minibatch(
         observation=observation,
         action=action,
         inputs=parts.inputs if central else jnp.concatenate([observation, action], axis=-1),
-        reward=part(layout.team_mean(parts.reward), place.agent, 1)[..., 0],
+        reward=_entries(layout.team_mean(parts.reward), place.agent, 1)[..., 0],
         discount=parts.discount if layout.n_step == 1 or parts.more is None else parts.discount * gamma**parts.more,
         next_observations=every_next if central else (own_next,),
         next_x=parts.next_x if central else own_next,
@@ -118,13 +114,15 @@ def minibatch(
     return whole if sequences is None else _with_histories(layout, group, whole, layout.row_parts(sequences), place)
 
 
+def _entries(whole: chex.Array, start: chex.Array, size: int) -> chex.Array:
+    """`size` entries of the last axis, from `start` on."""
+    return jax.lax.dynamic_slice_in_dim(whole, start, size, axis=-1)
+
+
 def _with_histories(layout: JointLayout, group: Group, batch: Minibatch, parts: RowParts, place: Place) -> Minibatch:
     """The minibatch of one member with what recurrent networks take of its sequences [sequences, steps]."""
     assert parts.more is not None and parts.state is not None
     more, first = parts.more, parts.state[:, 0]
-
-    def cut(whole: chex.Array, start: chex.Array, size: int) -> chex.Array:
-        return jax.lax.dynamic_slice_in_dim(whole, start, size, axis=-1)
 
     def of(other: Group) -> History | None:
         if not other.recurrent:
@@ -138,10 +136,10 @@ def _with_histories(layout: JointLayout, group: Group, batch: Minibatch, parts: 
 
     own = None
     if group.recurrent:
-        observation = cut(parts.x, place.observation, group.observation_size)
-        action = cut(parts.action, place.action, group.action_space.size)
+        observation = _entries(parts.x, place.observation, group.observation_size)
+        action = _entries(parts.action, place.action, group.action_space.size)
         starts = np.cumsum([0, *layout.state_sizes[:-1]])
-        start = cut(first, jnp.asarray(starts)[place.agent], group.state_size)
+        start = _entries(first, jnp.asarray(starts)[place.agent], group.state_size)
         own = History(jnp.concatenate([observation, action], axis=-1), more, start)
     central = group.algorithm.central
     critic = None if own is None else History(parts.inputs if central else own.inputs, more)

@@ -68,12 +68,9 @@ class Learner:
                 index_key, update_key = jax.random.split(keys[u])
                 indices = replay.sample_indices(index_key, places, (batches, drawn))
                 raw = self._drawn(state, hyper, seed, minibatch.own_part(indices, axis, dimension=-1))
-                sequences = None
-                if self.layout.recurrent:
-                    sequences = self._normalized(state, seed, raw)
-                    raw = raw[..., self.layout.burn_in :, :].reshape(batches, -1, raw.shape[-1])
-                others = frozen.next_actions(self.layout, states, raw)
-                rows = self._normalized(state, seed, raw)
+                others = frozen.next_actions(self.layout, states, self._learned(raw))
+                normalized = self._normalized(state, seed, raw)
+                rows, sequences = self._learned(normalized), normalized if self.layout.recurrent else None
                 move = [(first + u + 1) % group.algorithm.policy_delay == 0 for group in groups]
                 how = (schedule.sequential, self.sharding.on_cpu, axis, others, schedule.random_order, sequences)
                 states, m = update.update(self.layout, states, hyper, rows, update_key, move, *how)
@@ -112,6 +109,13 @@ class Learner:
         # offset, depend on the updates. A mean squared error is never negative; XLA does not know.
         wait = jnp.any(metrics.critic_loss < 0).astype(jnp.int32)
         return state._replace(groups=states, key=keys[:, 1], rollouts=state.rollouts + wait), metrics
+
+    def _learned(self, rows: chex.Array) -> chex.Array:
+        """Rows [minibatches, batch, row_size] that networks learn from; of sequences [minibatches, sequences, steps,
+        row_size] all steps but the first ones, which only bring states up to date."""
+        if not self.layout.recurrent:
+            return rows
+        return rows[..., self.layout.burn_in :, :].reshape(rows.shape[0], -1, rows.shape[-1])
 
     def minibatches(
         self, state: TrainState, hyper: Sequence[HyperParams], seed: chex.Array | int, indices: chex.Array
