@@ -449,6 +449,21 @@ def test_a_hybrid_run_of_two_processes_is_that_of_one(tmp_path, monkeypatch):
         assert json.loads((several / "agents" / "summary.json").read_text())["total_steps"] == 300
 
 
+@pytest.mark.slow
+def test_a_recurrent_run_of_two_processes_is_that_of_one(tmp_path, monkeypatch):
+    """What the actors remember while they act, and what the replay keeps of it, are of each process's own seeds."""
+    monkeypatch.setattr(ocp, "StandardCheckpointer", OneAtATime)
+    memory = ["algo.actor=gru", "algo.gru_units=4", "sequence_length=4", "burn_in=2"]
+    settings = config.load([*TINY, *memory, "checkpoint_every=0", "total_steps=400", "seeds=3"])
+    for size in (2, 1):
+        together(size, lambda processes: Recorder(processes).start(settings, tmp_path / str(processes.size)))
+    several, one = tmp_path / "2", tmp_path / "1"
+    same_numbers(table(several), table(one))
+    states = [checkpoint.read_state(checkpoint.verify(run / "checkpoints"), 0, 3, 3) for run in (several, one)]
+    assert any("gru" in name for name in states[1])
+    same_numbers(*states, rtol=1e-4)
+
+
 def leaves_of_start(run: Path) -> dict[str, np.ndarray]:
     with np.load(run / "start.npz") as file:
         return {name: file[name] for name in file.files}

@@ -66,6 +66,18 @@ def test_who_diverged_or_has_no_score_loses():
     assert chosen([1.0, nothing, nothing], [0, 0, 0], 0.5) == [(1, 0)]
 
 
+def test_nobody_copies_one_that_is_no_better():
+    """Before learning starts all members play alike, and a copy would only lose a setting."""
+    nobody = np.zeros(4, bool)
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        assert population.select(np.full(4, -3.0), nobody, 0.5, rng) == []
+        assert population.select(np.array([2.0, 2, 1, 2]), nobody, 0.25, rng)[0][0] == 2
+        two = population.select(np.array([2.0, 5, 2, 2]), nobody, 0.5, rng)
+        assert len(two) == 2 and {parent for _, parent in two} == {1}
+        assert population.select(np.array([2.0, 2, 2, np.nan]), np.array([0, 0, 0, 1], bool), 0.25, rng)[0][0] == 3
+
+
 # ---- exploration -----------------------------------------------------------------------------------------------------
 
 

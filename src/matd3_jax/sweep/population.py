@@ -77,8 +77,9 @@ def select(
 ) -> list[tuple[int, int]]:
     """Choose by truncation which members copy which: pairs (member, the one that it copies).
 
-    The worst `fraction` copy, each a random one of the best `fraction`. A member without a score ranks below all that
-    have one, one that diverged below these; all that diverged copy. Nobody copies where nobody has a score.
+    The worst `fraction` copy, each a random one of the best `fraction`, of those with a higher score. A member without
+    a score ranks below all that have one, one that diverged below these; all that diverged copy. Nobody copies where
+    nobody has a score, or all have the same: before learning starts members play alike.
 
     Args:
         scores: [members], the more the better; nan where there is none.
@@ -89,7 +90,12 @@ def select(
     ascending = np.lexsort((scores, standing))
     losers = ascending[: max(number, int(diverged.sum()))].tolist()
     best = [m for m in ascending[::-1][:number].tolist() if standing[m] == 2 and m not in losers]
-    return [(loser, best[rng.integers(len(best))]) for loser in losers] if best else []
+    pairs = []
+    for loser in losers:
+        better = [m for m in best if standing[loser] < 2 or scores[m] > scores[loser]]
+        if better:
+            pairs.append((loser, better[rng.integers(len(better))]))
+    return pairs
 
 
 def explored(axes: Sequence[Axis], values: Sequence[str], how: str, rng: np.random.Generator) -> tuple[str, ...]:
