@@ -153,15 +153,17 @@ def compare(
     kind: Literal["greater", "no difference", "no gain"] = "greater",
     margin: float = 0.0,
     more: str = "",
+    paired: bool = False,
 ) -> Claim:
     """The claim that the mean of `first` is greater than that of `second` (or another `kind`): (name, values
-    [seeds])."""
-    quantity = f"{quantity}: {first[0]} minus {second[0]}"
+    [seeds]). `paired`: seed by seed, for what is the same run up to some point."""
+    quantity = f"{quantity}: {first[0]} minus {second[0]}{', seed by seed' * paired}"
     (one, a), (other, b) = first, second
     if a is None or b is None:
         return Claim(paper, quantity, kind=kind, margin=margin)
     found = ", ".join(f"{name} {number(v.mean())} (n = {len(v)})" for name, v in ((one, a), (other, b)))
-    return Claim(paper, quantity, difference(a, b), kind, margin, found + more)
+    between = mean(a - b) if paired else difference(a, b)
+    return Claim(paper, quantity, between, kind, margin, found + more)
 
 
 def lines(claims: Sequence[Claim]) -> list[str]:

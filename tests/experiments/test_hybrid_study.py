@@ -63,6 +63,7 @@ def test_report(runs, tmp_path, monkeypatch):
         "27.5" in table and "| hybrid | 2 | 100 | 100 ± 1 " in table and "| TD3, as wide | 2 | 100 | 91 ± 1 " in table
     )
     assert table.count("**same**") == 5, table
+    assert table.count(", seed by seed") == 1 and ": hybrid minus MATD3, seed by seed | hybrid 85 " in table
     axes = figures[out / "curves.png"].axes
     assert [label.split(" (")[0] for label in pictures.lines(axes[0])][:4] == list(hybrid.COLORS)
     np.testing.assert_allclose(pictures.lines(axes[0])["hybrid (2 seeds)"][1], curve("hybrid", np.array(STEPS)))

@@ -26,6 +26,9 @@ def test_tests_agree_with_r():
     np.testing.assert_allclose(
         numbers(verdict.mean(SLEEP[0] - SLEEP[1])), [-1.58, -2.4598858, -0.7001142, 0.002833], rtol=1e-3
     )
+    pairs = verdict.compare("paper", "extra", ("group 1", SLEEP[0]), ("group 2", SLEEP[1]), paired=True)
+    assert pairs.quantity == "extra: group 1 minus group 2, seed by seed" and pairs.verdict == "opposite"
+    assert numbers(pairs.difference) == numbers(verdict.mean(SLEEP[0] - SLEEP[1]))
     # cor.test(x1, y1)
     np.testing.assert_allclose(
         numbers(verdict.correlation(X, Y)), [0.8164205, 0.4243912, 0.9506933, 0.00217], rtol=1e-3
