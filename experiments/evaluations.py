@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import EngFormatter
 
 from experiments import figures
 from experiments.tidy import Table
@@ -40,6 +41,7 @@ def draw(axis: Axes, part: Table, column: str, color: str, label: str, dashes: s
     estimate = Estimate(mean, mean - deviation, mean + deviation)
     style.band(axis, steps, estimate, color, f"{label} ({seeds(len(curves))})", dashes)
     axis.set_xlabel("env steps of each seed")
+    axis.xaxis.set_major_formatter(EngFormatter(sep=""))
     axis.set_ylabel(f"evaluation: {COLUMNS[column]}")
 
 
