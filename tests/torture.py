@@ -1,10 +1,10 @@
-"""`python -m tests.torture minutes=N [seed=0]`: kill and starve runs, damage their files, and resume them.
+"""`python -m tests.torture minutes=N [seed=0] [key=value ...]`: kill and starve runs, damage their files, resume them.
 
 Tiny runs are trained by processes of their own, which are killed (SIGKILL) or get errors at random ones of the calls
 with which they change files, at named ones, or at random times; files of run directories are damaged; two processes are
 started at once. Then the run is resumed: it must come to the unbroken run's numbers to the bit (metrics.csv and every
 array of its last checkpoint), or say in one line what it cannot do. Prints a table of faults and outcomes; the exit
-code is 1 where one was neither.
+code is 1 where one was neither. Other words are settings of all runs, such as algo.actor=gru.
 """
 
 import collections
@@ -19,7 +19,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "helpers"))
@@ -29,6 +29,8 @@ import numpy as np  # noqa: E402
 from checkpoint_arrays import assert_same_arrays, assert_same_run, leaves  # noqa: E402
 from disturbed import Ended, Job, Process  # noqa: E402
 
+from matd3_jax import config  # noqa: E402
+from matd3_jax.errors import UserError  # noqa: E402
 from matd3_jax.runs.directory import RunDirectory  # noqa: E402
 from matd3_jax.training import checkpoint  # noqa: E402
 
@@ -48,16 +50,14 @@ UNNOTICED = "changed, without a checksum to notice"
 Outcome = str
 
 
-def train(path: Path) -> list[str]:
-    return ["train", *TRAIN, f"out={path.parent}", f"name={path.name}"]
+def merged(usual: Sequence[str], settings: Sequence[str]) -> list[str]:
+    """The usual settings, those for the same keys replaced."""
+    own = {text.split("=")[0] for text in settings}
+    return [*(text for text in usual if text.split("=")[0] not in own), *settings]
 
 
 def resume(path: Path, *more: str) -> list[str]:
     return ["train", f"resume={path}", *more]
-
-
-def sweep(path: Path, *more: str) -> list[str]:
-    return ["sweep", *SWEEP, f"out={path.parent}", f"name={path.name}", *more]
 
 
 def lines(ended: Ended) -> list[str]:
@@ -96,6 +96,8 @@ class Torture:
 
     place: Path
     rng: random.Random
+    settings: tuple[str, ...] = ()
+    """Of all runs, besides the usual ones or in their place."""
     table: dict[tuple[str, str, Outcome], int] = dataclasses.field(default_factory=collections.Counter)
     failures: list[str] = dataclasses.field(default_factory=list)
     kills: int = 0
@@ -106,18 +108,24 @@ class Torture:
         self.process, self.other = Process(self.place), Process(self.place)
         self.whole, self.whole_sweep = self.place / "whole" / "run", self.place / "whole sweep" / "sweep"
         begun = time.monotonic()
-        first = self.run(Job(train(self.whole), self.whole.parent))
+        first = self.run(Job(self.train(self.whole), self.whole.parent))
         assert first.code == 0, first.output
         self.calls = first.calls
         again = self.place / "again" / "run"
         begun = time.monotonic()
-        assert self.run(Job(train(again), again.parent)).code == 0
+        assert self.run(Job(self.train(again), again.parent)).code == 0
         self.seconds = time.monotonic() - begun
         assert same(again, self.whole) == ""
-        swept = self.run(Job(sweep(self.whole_sweep), self.whole_sweep.parent))
+        swept = self.run(Job(self.sweep(self.whole_sweep), self.whole_sweep.parent))
         assert swept.code == 0, swept.output
         self.sweep_calls = swept.calls
         self.number = 0
+
+    def train(self, path: Path) -> list[str]:
+        return ["train", *merged(TRAIN, self.settings), f"out={path.parent}", f"name={path.name}"]
+
+    def sweep(self, path: Path, *more: str) -> list[str]:
+        return ["sweep", *merged(SWEEP, self.settings), f"out={path.parent}", f"name={path.name}", *more]
 
     def close(self) -> None:
         self.process.close()
@@ -155,7 +163,7 @@ class Torture:
 
     def start_or_resume(self, path: Path) -> Ended:
         """What a user does after a run ended before its time."""
-        return self.run(Job(resume(path) if path.exists() else train(path), path.parent))
+        return self.run(Job(resume(path) if path.exists() else self.train(path), path.parent))
 
     def settle(self, fault: str, path: Path, ended: Ended) -> None:
         """Resume a run after a fault, and note whether it comes to the unbroken run's bits."""
@@ -172,31 +180,31 @@ class Torture:
 
     def kill_at_a_call(self) -> None:
         path, how = self.path(), self.rng.choice(["kill", "kill after", "half"])
-        ended = self.run(Job(train(path), path.parent, how, self.rng.randrange(len(self.calls))))
+        ended = self.run(Job(self.train(path), path.parent, how, self.rng.randrange(len(self.calls))))
         self.settle("SIGKILL at a random call", path, ended)
 
     def power_cut(self) -> None:
         """At a random call; of every file is left what was synced."""
         path = self.path()
-        ended = self.run(Job(train(path), path.parent, "power", self.rng.randrange(len(self.calls))))
+        ended = self.run(Job(self.train(path), path.parent, "power", self.rng.randrange(len(self.calls))))
         self.settle("power cut at a random call", path, ended)
 
     def kill_at_a_time(self) -> None:
         path = self.path()
-        ended = self.run(Job(train(path), path.parent, after=self.rng.uniform(0, 1.1 * self.seconds)))
+        ended = self.run(Job(self.train(path), path.parent, after=self.rng.uniform(0, 1.1 * self.seconds)))
         self.settle("SIGKILL at a random time", path, ended)
 
     def kill_there(self, fault: str, pattern: str, hows: tuple[str, ...]) -> None:
         path = self.path()
         at = self.rng.randrange(sum(bool(re.search(pattern, call)) for call in self.calls))
-        ended = self.run(Job(train(path), path.parent, self.rng.choice(hows), at, pattern))
+        ended = self.run(Job(self.train(path), path.parent, self.rng.choice(hows), at, pattern))
         self.settle(fault, path, ended)
 
     def kill_at_resumes(self) -> None:
         """Killed again and again, at the resumes too; once by an older checkpoint."""
         path = self.path()
         at = self.rng.randrange(len(self.calls) // 3, len(self.calls))
-        ended = self.run(Job(train(path), path.parent, "kill", at))
+        ended = self.run(Job(self.train(path), path.parent, "kill", at))
         for _ in range(self.rng.randint(1, 3)):
             steps = checkpoint.steps(path / "checkpoints")
             more = [f"checkpoint={steps[0]}"] if len(steps) > 1 and self.rng.random() < 0.5 else []
@@ -209,13 +217,13 @@ class Torture:
         path = self.path()
         pattern = f"^({'|'.join(calls.split())}) "
         at = self.rng.randrange(sum(bool(re.search(pattern, call)) for call in self.calls))
-        ended = self.run(Job(train(path), path.parent, how, at, pattern))
+        ended = self.run(Job(self.train(path), path.parent, how, at, pattern))
         self.settle({"short": "short write"}.get(how, how), path, ended)
 
     def file_limit(self) -> None:
         """No file may grow beyond some bytes: fails in Orbax's C++, too."""
         path = self.path()
-        ended = self.run(Job(train(path), path.parent, largest=self.rng.choice([100, 1000, 3000, 6000, 12000])))
+        ended = self.run(Job(self.train(path), path.parent, largest=self.rng.choice([100, 1000, 3000, 6000, 12000])))
         self.settle("EFBIG (also in C++)", path, ended)
 
     def damage_a_checkpoint(self) -> None:
@@ -271,8 +279,8 @@ class Torture:
         """A sweep that is killed while it plans is started again with the same command."""
         path = self.path("sweep")
         how = self.rng.choice(["kill", "kill after", "half"])
-        ended = self.run(Job(sweep(path, "train=false"), path.parent, how, self.rng.randrange(self.planned() + 1)))
-        again = self.run(Job(sweep(path, "train=false"), path.parent))
+        ended = self.run(Job(self.sweep(path, "train=false"), path.parent, how, self.rng.randrange(self.planned() + 1)))
+        again = self.run(Job(self.sweep(path, "train=false"), path.parent))
         if again.code == 2 and (path / "sweep.json").exists():
             again = again._replace(code=0)  # the plan was there already
         self.compare_sweeps("sweep killed while it plans", path, ended, again, trained=False)
@@ -280,7 +288,7 @@ class Torture:
     def kill_a_sweep(self) -> None:
         path = self.path("sweep")
         at = self.rng.randrange(self.planned() + 3, len(self.sweep_calls))
-        ended = self.run(Job(sweep(path), path.parent, self.rng.choice(["kill", "kill after", "half"]), at))
+        ended = self.run(Job(self.sweep(path), path.parent, self.rng.choice(["kill", "kill after", "half"]), at))
         again = self.run(Job(["sweep", f"resume={path}"], path.parent))
         self.compare_sweeps("sweep killed while it trains", path, ended, again, trained=True)
 
@@ -375,10 +383,13 @@ def _same_member(path: Path, whole: Path) -> str:
 
 def main(argv: list[str]) -> int:
     """Trials for as long as is given; the exit code."""
-    given = dict(text.split("=", 1) for text in argv)
-    minutes, seed = float(given.pop("minutes", 5)), int(given.pop("seed", 0))
-    if given:
-        raise SystemExit(f"error: cannot take {', '.join(given)}; valid: minutes=N, seed=N")
+    try:
+        given = dict(text.split("=", 1) for text in argv)
+        minutes, seed = float(given.pop("minutes", 5)), int(given.pop("seed", 0))
+        settings = tuple(f"{key}={value}" for key, value in given.items())
+        config.load(merged(TRAIN, settings))
+    except (ValueError, UserError) as error:
+        raise SystemExit(f"error: {error}; usage: minutes=N, seed=N, settings of all runs") from None
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     with tempfile.TemporaryDirectory(prefix="torture-") as folder:
         cache = Path(folder) / "compiled"
@@ -386,7 +397,7 @@ def main(argv: list[str]) -> int:
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
-        torture = Torture(Path(folder), random.Random(seed))
+        torture = Torture(Path(folder), random.Random(seed), settings)
         try:
             end = time.monotonic() + 60 * minutes
             print(f"an unbroken run: {torture.seconds:.1f} s, {len(torture.calls)} calls that change files", flush=True)

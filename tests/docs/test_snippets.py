@@ -80,7 +80,7 @@ def test_command(command):
     short = name.split(".")[-1]
     module = importlib.import_module(f"matd3_jax.cli.{short}" if name.startswith("matd3_jax.") else inner)
     if name == "tests.torture":
-        assert {word.split("=")[0] for word in given} <= {"minutes", "seed"}
+        config.load([word for word in given if word.split("=")[0] not in ("minutes", "seed")])
         return
     is_study = isinstance(getattr(module, "STUDY", None), study.Study)
     ours = catalog.COMMANDS.get(short) if name.startswith("matd3_jax.") else None
