@@ -67,3 +67,14 @@ def test_report(runs, tmp_path, monkeypatch):
     axes = figures[out / "curves.png"].axes
     assert [label.split(" (")[0] for label in pictures.lines(axes[0])][:4] == list(hybrid.COLORS)
     np.testing.assert_allclose(pictures.lines(axes[0])["hybrid (2 seeds)"][1], curve("hybrid", np.array(STEPS)))
+
+
+def test_seeds_are_pairs_where_they_began_alike():
+    """MATD3 has no evaluation at the switch itself; one number that differs before it is another run."""
+    steps, values = np.array(STEPS), np.arange(22.0).reshape(2, 11)
+    ours = np.insert(steps, 3, 28), np.insert(np.where(steps > 30, values + 5, values), 3, 1.0, axis=1)
+    assert hybrid.began_alike(ours, (steps, values))
+    other = values.copy()
+    other[1, 2] += 1e-9
+    assert not hybrid.began_alike(ours, (steps, other)) and not hybrid.began_alike(ours, (steps, values[:1]))
+    assert not hybrid.began_alike(ours, None)
