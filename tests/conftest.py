@@ -4,6 +4,7 @@ Nearly all of the suite's time goes into compiling. Therefore everything, single
 start included, is compiled with little optimization, and a program that was compiled once is loaded from then on.
 """
 
+import collections
 import functools
 import gc
 import importlib.metadata
@@ -63,6 +64,15 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         config.option.numprocesses = min(cores, WORKERS)
         config.option.dist = "loadfile"  # fixtures of a module are made once
+        config.option.loadscopereorder = False  # or the files with the fewest tests, long ones, would come last
+
+
+@pytest.hookimpl(trylast=True)  # when -m has chosen
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files that take long: in the end no worker waits for one of them."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    number = collections.Counter(item.path for item in items)
+    items.sort(key=lambda item: (item.path not in slow, -number[item.path]))
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
