@@ -8,6 +8,7 @@ import collections
 import functools
 import gc
 import importlib.metadata
+import math
 import os
 import shutil
 import tempfile
@@ -28,7 +29,10 @@ FULL = {"xla_backend_optimization_level": 3, "xla_llvm_disable_expensive_passes"
 """What programs compile with outside of the tests."""
 
 WORKERS = 4
-"""At most: each needs up to 2 GB."""
+"""At most: each needs up to 3 GB."""
+
+KEPT_BYTES = 2 * 2**30
+"""Of a worker, above which it forgets its programs between files; most of them no other file runs."""
 
 IN_WORKER = "PYTEST_XDIST_WORKER" in os.environ
 """Set by pytest-xdist before this file is read, and by it in all that a worker starts."""
@@ -41,6 +45,9 @@ if not IN_WORKER:  # workers get all of it from the process that starts them
     flags = [f"--{name}={str(value).lower()}" for name, value in OPTIONS.items()]
     os.environ["XLA_FLAGS"] = " ".join([*flags, os.environ.get("XLA_FLAGS", "")]).strip()
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # workers share an accelerator
+    # A program would carry where in the code each operation stands: a tenth of the time of compiling it.
+    os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
+    os.environ.setdefault("JAX_INCLUDE_FULL_TRACEBACKS_IN_LOCATIONS", "false")
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="matd3_jax-tests-")
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
@@ -81,12 +88,27 @@ def pytest_unconfigure(config: pytest.Config) -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+def pytest_collection_finish() -> None:
+    """Never look again for garbage among what the imports left: a collection takes half as long."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture(scope="module", autouse=True)
 def release_programs():
-    """Forget what a file compiled: a worker would end with 6 GB of programs that no other file runs."""
+    """Forget what was compiled, once it takes much memory: a worker would end with 6 GB of programs."""
     yield
-    jax.clear_caches()
-    gc.collect()
+    if resident_bytes() > KEPT_BYTES:
+        jax.clear_caches()
+        gc.collect()
+
+
+def resident_bytes() -> float:
+    """Memory of this process, infinite where Linux does not say."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return math.inf
 
 
 @pytest.fixture(scope="session")
