@@ -26,6 +26,7 @@ def test_functions_that_are_used_most_have_examples():
     assert names >= {"matd3_jax.envs.make", "matd3_jax.training.train.train", "matd3_jax.stats.intervals.compare"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda found: found.name)
 def test_example(example):
     report = []

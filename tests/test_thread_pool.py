@@ -14,7 +14,7 @@ import pytest
 from matd3_jax import config, envs
 from matd3_jax.thread_pool import THREADS, calls_lapack
 
-pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("error::RuntimeWarning")]
 
 ELSEWHERE = {name: value for name, value in os.environ.items() if name not in ("NPROC", "XLA_FLAGS")}
 

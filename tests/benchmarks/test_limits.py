@@ -12,6 +12,8 @@ from matd3_jax import config
 from matd3_jax.errors import UserError
 from matd3_jax.training.session import TrainingSession
 
+pytestmark = pytest.mark.slow
+
 SMALL = ("total_steps=100", "replay_capacity=100", "learning_starts=100", "batch_size=16", "algo.hidden=[8,6]")
 
 

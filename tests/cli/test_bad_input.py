@@ -141,6 +141,7 @@ GROUPS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prefix", GROUPS)
 def test_settings(prefix, capsys):
     cls, more = GROUPS[prefix]

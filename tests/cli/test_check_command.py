@@ -52,6 +52,7 @@ def way_on(said):
     return words[3:]
 
 
+@pytest.mark.slow
 def test_a_finished_run(run, capsys):
     code, said = checked(run, capsys)
     steps = ", ".join(f"{step:,}" for step in checkpoint.steps(run / "checkpoints"))
@@ -114,6 +115,7 @@ def no_machine(run):
     return ["machine.json is missing or not whole"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "damage",
     [

@@ -44,6 +44,7 @@ def test_resumed_to_the_bit(tmp_path):
     assert -60 < float(last["agent_0_q_value"]) < 5
 
 
+@pytest.mark.slow
 def test_swept(tmp_path: Path):
     """Each head is a program of its own, and learns as the same run made alone; so is each norm."""
     line = [*TINY, *DISTRIBUTION[:2]]

@@ -22,6 +22,8 @@ from matd3_jax.runtime import devices
 from matd3_jax.training import checkpoint
 from matd3_jax.training.session import TrainingSession
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):

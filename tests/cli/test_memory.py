@@ -69,6 +69,7 @@ def test_from_python_too(sixteen, no_start):
         TrainingSession(config.load([*SMALL, "eval_episodes=1000000000"])).start()
 
 
+@pytest.mark.slow
 def test_evaluations_and_films_that_cannot_fit_are_refused(sixteen, tmp_path, monkeypatch):
     """Before the checkpoint is read: none is there."""
     directory = tmp_path / "run"

@@ -22,6 +22,8 @@ from matd3_jax.training import checkpoint
 from matd3_jax.training.session import TrainingSession
 from matd3_jax.video import encode, frames
 
+pytestmark = pytest.mark.slow
+
 TINY = [
     "env=simple_push", "adversary=maddpg", "seeds=3", "seed=5", "algo.hidden=[8]", "adversary.hidden=[8]",
     "batch_size=16", "num_envs=2", "learning_starts=200", "replay_capacity=500", "total_steps=1000", "eval_every=0",

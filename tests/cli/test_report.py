@@ -226,6 +226,7 @@ def test_many_settings_are_compared_with_the_best(tmp_path):
     assert len(of_agents) == 7 and all(row[0][0].startswith("tau=0.04 minus ") for row in of_agents)
 
 
+@pytest.mark.slow
 def test_films_are_inside_found_or_made(tmp_path):
     """The last that was made while training; without any one of the last checkpoint."""
     tiny = ["env=point_reach", "seeds=2", "algo.hidden=[8]", "batch_size=16", "num_envs=2", "learning_starts=100",

@@ -18,6 +18,8 @@ from matd3_jax import config
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import devices
 
+pytestmark = pytest.mark.slow
+
 SMALL = {
     "seeds": 2, "total_steps": 400, "learning_starts": 100, "num_envs": 2, "rollout_length": 5, "batch_size": 16,
     "replay_capacity": 400, "log_every": 100, "eval_every": 200, "eval_episodes": 2,

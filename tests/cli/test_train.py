@@ -25,6 +25,8 @@ from matd3_jax.runtime import devices
 from matd3_jax.training import announcement, checkpoint, cost
 from matd3_jax.training.session import TrainingSession
 
+pytestmark = pytest.mark.slow
+
 # A schedule and networks so small that a run takes a second; every part of the real one is there, two teams included.
 TINY = [
     "env=simple_push", "adversary=maddpg", "seeds=3", "algo.hidden=[8]", "adversary.hidden=[8]", "batch_size=16",

@@ -48,6 +48,7 @@ def layout_of(env):
     return JointLayout.of(env, {team: MADDPG if team == "adversaries" else MATD3 for team in env.teams})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", ENVIRONMENTS, ids=str)
 def test_layout(env):
     """Rows and joint vectors of what the environment really gives: every part comes back where it was put, and a row is

@@ -53,6 +53,7 @@ def test_its_networks_stay_the_same_to_the_bit(how):
     assert np.isnan(np.asarray(metrics.update.critic_loss)).all(axis=(0, 1)).tolist() == [True, False, False]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adversarial", [False, True])
 def test_learners_updates_are_those_against_opponents_that_stand_still(adversarial):
     """One update from the same rows: the same networks, optimizers and losses, to rounding; adversarial: what opponents
@@ -108,6 +109,7 @@ def test_learners_updates_are_those_against_opponents_that_stand_still(adversari
     assert np.isnan(metrics.critic_loss[0]) and np.isnan(metrics.actor_loss[0])
 
 
+@pytest.mark.slow
 def test_it_plays_without_noise_whatever_the_others_do():
     """While collecting, in a random warm-up, and in sampled episodes."""
     env = make("simple_adversary")

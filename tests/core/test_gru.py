@@ -166,6 +166,7 @@ def learned():
     return found, want
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("agent", [0, 1])
 def test_losses_and_their_slopes(learned, agent):
     """Every part of the recurrent units and of the perceptrons that read their states."""

@@ -84,6 +84,7 @@ def by_python(rows, n):
 
 
 # Two rollouts: the ring fills up; 5: just full; 8: round once and a half, the seam in the middle.
+@pytest.mark.slow
 @pytest.mark.parametrize("rollouts", [2, 5, 8])
 @pytest.mark.parametrize("n", [2, 3, 7])
 def test_returns_by_python(n, rollouts):

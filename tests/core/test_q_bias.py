@@ -207,6 +207,7 @@ def run(slots=SLOTS):
     return t, states, measured, len(compilations)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("state", "rollouts"), [(0, (0, 2)), (1, (0, 4)), (2, (4, 6)), (3, (4, 8))])
 def test_the_reservoir_is_uniform_since_the_last_evaluation(state, rollouts):
     """Each pair is one transition of the replay, state and all; each transition since the last evaluation, and no

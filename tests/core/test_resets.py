@@ -53,6 +53,7 @@ def played(env):
     return end, np.asarray(rows), list(resets)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joint", [False, True])
 def test_resets_are_made_where_they_are_needed(joint):
     made = []

@@ -64,6 +64,7 @@ def of_seed(statistics, seed):
 # ---- the statistics --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_statistics_of_everything_collected():
     """After the warm-up and after each rollout, also when the ring has dropped the first rows: mean and variance of
     each entry over all observations acted on, for each seed its own."""

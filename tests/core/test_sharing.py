@@ -127,6 +127,7 @@ def numbers(tree):
     return [] if tree is None else [np.asarray(tree)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_update_equals_reference(name):
     """All parameters, targets, moments and losses after one update."""

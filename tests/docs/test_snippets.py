@@ -63,6 +63,7 @@ def test_there_are_commands_of_every_kind():
     assert {"matd3_jax." + name for name in ("train", "sweep", "evaluate", "render", "plot", "crossplay")} < found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
 def test_command(command):
     """The module is there; the settings can be read, and have values that a run could have."""

@@ -73,6 +73,7 @@ SINGLE = {
 }
 
 
+@pytest.mark.slow
 def test_single_steps_end_where_those_of_the_recording_end(ant, single, recorded):
     state = single.state
     errors = {

@@ -60,6 +60,7 @@ def random_action(env, rng):
     return tuple(rng.uniform(-1, 1, space.size).astype(np.float32) for space in env.action_spaces)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", [pytest.param(r, marks=[pytest.mark.slow] * (r != "ant")) for r in ROBOTS])
 def test_steps_are_brax_s_own(robot):
     """Reset and three steps with the same key and actions, in one program, so that nothing but our part can differ."""
@@ -110,6 +111,7 @@ def test_steps_are_brax_s_own(robot):
     assert np.abs(measured[:, 0]).min() > 1e-4  # it does move
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in names() if name.startswith("brax_")])
 def test_state_keeps_its_types(name):
     """A weak type or another dtype would compile the step twice, and break scans."""
@@ -301,6 +303,7 @@ def test_partitions_can_be_written_on_the_command_line():
         assert env == make("brax_ant", split=split, backend="positional") and len(env.agents) == agents
 
 
+@pytest.mark.slow
 def test_nothing_is_printed_or_logged(tmp_path):
     """Neither brax's and MJX's remarks, nor what MuJoCo's compiler says about half_cheetah's file."""
     code = "from matd3_jax.envs import make; make('brax_half_cheetah').mj_model"

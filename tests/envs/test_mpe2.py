@@ -96,6 +96,7 @@ def mpe2_step(parallel, env, state, action):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("actions", ["discrete", "continuous"])
 @pytest.mark.parametrize("task", TASKS, ids=lambda task: "-".join([task[0], *(f"{k}{v}" for k, v in task[2].items())]))
 def test_steps(task, actions, observe_and_step):

@@ -123,6 +123,7 @@ def simple_world_comm(bodies, pos, vel, comm, landmark, goal):
 RULES = {"simple": simple, "simple_reference": simple_reference, "simple_world_comm": simple_world_comm}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("actions", ["soft", "discrete", "continuous"])
 @pytest.mark.parametrize("task", TASKS, ids=lambda task: task[0] + "-other" * bool(task[1]))
 def test_steps(task, actions, observe_and_step):

@@ -66,6 +66,7 @@ def test_all_recordings_are_there():
     assert len(tasks) == 18  # six tasks: orig soft (also one-hot), mpe2 discrete, mpe2 continuous
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float64, np.float32], ids=["float64", "float32"])
 @pytest.mark.parametrize("file", FILES, ids=[file.stem for file in FILES])
 def test_steps(file, dtype, observe_and_step):

@@ -79,6 +79,7 @@ def random_actions(env, policy, rng):
     return tuple((w / w.sum(axis=-1, keepdims=True)).astype(np.float32) for w in weights)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", MEASURED, ids="-".join)
 def test_random_policy(case):
     name, rules, policy = case

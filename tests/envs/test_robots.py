@@ -94,6 +94,7 @@ def cases():
             yield pytest.param(name, physics, marks=[pytest.mark.slow] * slow, id=f"{physics}-{name}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "physics"), [*cases()])
 def test_steps_are_those_of_gymnasium(name, physics):
     env = make(name, physics=physics, split="single")
@@ -134,6 +135,7 @@ def test_steps_are_those_of_gymnasium(name, physics):
 
 
 # Only the humanoid's reset asks the engine.
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "physics"), [*((name, "c") for name in IDS), ("humanoid", "mjx")])
 def test_reset_is_gymnasiums(name, physics):
     env, other = make(name, physics=physics, split="single"), theirs(name)

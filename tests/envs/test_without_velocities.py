@@ -58,6 +58,7 @@ def sample(env, key):
     return tuple(space.sample(jax.random.fold_in(key, i)) for i, space in enumerate(env.action_spaces))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("robot", "split", "depth", "sizes"), CASES, ids=lambda part: str(part)[:12])
 def test_observations_are_the_usual_ones_less_the_velocities(robot, split, depth, sizes):
     usual, env = pair(robot, split, depth, physics="c")

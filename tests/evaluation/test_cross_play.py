@@ -36,6 +36,7 @@ def by_numpy(run, seed, team, observation):
     return dict(zip(who, actions, strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("one", "two"), [("mixed", "normal"), ("joint", "mixed"), ("normal", "joint")])
 def test_episodes_by_hand(one, two):
     """Seeds of different places, step after step with NumPy policies: the same mean returns of every agent."""
@@ -57,6 +58,7 @@ def test_episodes_by_hand(one, two):
     assert np.abs(got[0] - meet(runs(), one, two, [[0, 1]], episodes)[0]).max() > 1e-3, "seeds have their own policies"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RUNS)
 def test_own_pairs_are_evaluations(name):
     """Trained together, deterministic: the numbers of `evaluate`, team by team, which has never heard of teams."""
@@ -118,6 +120,7 @@ def test_order_and_batches(monkeypatch):
     assert len(np.unique(together.round(4), axis=0)) == 6
 
 
+@pytest.mark.slow
 def test_sampled_noise():
     """As in training, each team by itself: returns like those of sampled evaluations, and of policies without
     preferences nobody's noise goes with anybody's."""

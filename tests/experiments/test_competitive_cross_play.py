@@ -38,6 +38,7 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_command(folder, tmp_path, monkeypatch, capsys):
     argv = [f"runs={folder}", f"out={tmp_path / 'out'}", "episodes=3", "deterministic=true"]
     assert cross_play.main(argv) == 0

@@ -22,6 +22,7 @@ def trained(folder, label, final):
     fake_run(folder / "runs" / label, overrides, {"return_agents": (-500 + NOISE, final + NOISE)})
 
 
+@pytest.mark.slow
 def test_parts_come_together(tmp_path, one_study, capsys):
     """Each process finds its own runs finished; the results have the rows of both."""
     levels = {"sigma0": -400.0, "sigma0.1": -410.0, "sigma0.2": -420.0, "sigma0.4": -430.0}
@@ -39,6 +40,7 @@ def test_parts_come_together(tmp_path, one_study, capsys):
     assert "target_smoothing-1: finished" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_part_that_fails_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(parallel, "PARTS", {"target_smoothing": ("nothing",)})
     assert parallel.main([f"runs={tmp_path}", f"out={tmp_path / 'results'}"]) == 1

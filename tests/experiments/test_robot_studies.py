@@ -42,6 +42,7 @@ def words(claims):
     return [claim.verdict for claim in claims]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", [squashing, robots, recipe, ablation, critics])
 def test_tables_survive_their_file_and_every_setting_is_drawn(module, tmp_path):
     """Numbers and texts in a column (a noise, a range of noise) stay different settings after reading, too."""

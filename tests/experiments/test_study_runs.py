@@ -30,6 +30,7 @@ from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.sweep import runner
 
 
+@pytest.mark.slow
 def test_competitive_from_run_directories(tmp_path, monkeypatch):
     """The team of Predator-Prey is `adversaries`, which adversary= trains; elsewhere it is `agents`."""
     for env, algo, adversary in [

@@ -24,6 +24,7 @@ def example():
     return module
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "lines", [["env.split=halves"], ["algo=td3", "env.split=2x4"], ["env.velocities=false"]], ids=str
 )

@@ -22,6 +22,8 @@ from matd3_jax.export.policy import function
 from matd3_jax.training.saved_policies import SavedPolicies
 from matd3_jax.training.session import TrainingSession
 
+pytestmark = pytest.mark.slow
+
 SMALL = [
     "seeds=2", "seed=3", "num_envs=2", "learning_starts=100", "batch_size=8", "replay_capacity=400", "total_steps=200",
     "eval_every=0",

@@ -12,6 +12,7 @@ def lines_of(axis):
     return {label: line.tolist() for label, line in pictures.lines(axis).items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [1, 2])
 def test_curves_of_any_number_of_seeds(seeds, tmp_path, monkeypatch):
     path, figures = tmp_path / "q_bias.png", pictures.written(monkeypatch)

@@ -20,6 +20,8 @@ from matd3_jax.runtime.multihost import SINGLE_PROCESS
 from matd3_jax.training import checkpoint, host_states
 from matd3_jax.training.session import TrainingSession
 
+pytestmark = pytest.mark.slow
+
 SMALL = {
     **{"total_steps": 240, "learning_starts": 80, "num_envs": 2, "rollout_length": 7, "batch_size": 16},
     **{"replay_capacity": 560, "log_every": 56, "eval_every": 56, "eval_episodes": 2, "checkpoint_minutes": 0},
@@ -264,7 +266,6 @@ def test_what_an_environment_raises_ends_in_one_line(tmp_path, capfd):
     assert last.startswith("error: pettingzoo host_cases: step raised ZeroDivisionError: it was to fail")
 
 
-@pytest.mark.slow
 def test_it_learns():
     """Two numbers to be said, by their rewards alone: an untrained pair loses some 20 an episode, this one less than
     half of that after so short a training (3.6 and 6.9 here)."""

@@ -46,6 +46,7 @@ def test_a_second_process_learns_who_works_there_and_a_killed_one_is_taken_over(
         other.kill()
 
 
+@pytest.mark.slow
 def test_commands_start_without_fcntl():
     """As on Windows, which lacks it."""
     commands = "check, crossplay, evaluate, export, plot, render, report, sweep, train"

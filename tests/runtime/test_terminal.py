@@ -39,6 +39,7 @@ def test_nobody_reads():
     assert done.returncode == 0 and done.stderr == b""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", ["experiments.cooperative", "benchmarks.loop", "matd3_jax.train"])
 def test_nobody_reads_the_help(module):
     """Of studies and benchmarks, too, which print by the same functions (a rule of ruff sees to it)."""
@@ -82,6 +83,7 @@ command.run(main)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signals", [1, 2])
 def test_signals_while_nobody_reads_the_output(signals):
     """The first is noted, and what was said is not lost; a second one ends the program, which waits for no reader."""

@@ -18,6 +18,8 @@ from matd3_jax.sweep.lineage import Lineage
 from matd3_jax.training.copying import Copier
 from matd3_jax.training.session import TrainingSession
 
+pytestmark = pytest.mark.slow
+
 TINY = [
     "env=point_reach", "algo=iddpg", "algo.hidden=[4]", "batch_size=8", "num_envs=2", "learning_starts=100",
     "replay_capacity=400", "total_steps=600", "log_every=50", "eval_every=0",
@@ -171,7 +173,6 @@ def test_stopped_and_resumed_it_is_the_same_sweep(trained, tmp_path, monkeypatch
     assert (cut / "table.csv").read_text() == (folder / "table.csv").read_text()
 
 
-@pytest.mark.slow
 def test_a_population_does_not_depend_on_the_others(trained, tmp_path):
     """The second of the three alone."""
     folder, *_ = trained
@@ -184,7 +185,6 @@ def test_a_population_does_not_depend_on_the_others(trained, tmp_path):
         assert float(one["score"]) == pytest.approx(float(other["score"]), rel=1e-3)
 
 
-@pytest.mark.slow
 def test_a_member_that_diverged_is_trained_again(tmp_path, capsys):
     """With a rate of 1e30 networks are lost at once; they, the replay and the environments are replaced."""
     given = ["algo.lr=0.001,0.01,1e30", "pbt=true", "pbt_every=300", "log_every=100", "total_steps=800", "seeds=1"]

@@ -23,6 +23,8 @@ from matd3_jax.sweep.batch import Batch
 from matd3_jax.sweep.runner import Sweep
 from matd3_jax.training.session import TrainingSession
 
+pytestmark = pytest.mark.slow
+
 # Small enough to run in a second or two; both teams, an evaluation and the delay are there.
 TINY = [
     "env=simple_push", "adversary=maddpg", "algo.hidden=[8]", "adversary.hidden=[8]", "batch_size=16", "num_envs=2",
@@ -44,7 +46,6 @@ def test_one_batch_holds_what_shares_a_program(swept):
     assert len(Sweep(swept).batches) == 1 and len(Sweep(swept).batches[0]) == 4
 
 
-@pytest.mark.slow
 def test_each_member_equals_the_same_run_made_alone(swept, tmp_path):
     """Metrics, networks, optimizers, environments and keys of one member, against a run of its settings."""
     assert train.main([*TINY, "algo.lr=0.1", "algo.tau=0.01", "seeds=2", f"out={tmp_path}", "name=alone"]) == 0
@@ -144,7 +145,6 @@ def test_diverged_seeds_are_counted_and_come_last(swept, tmp_path):
     assert ranked[-1].interval("final")[0] == ranked[-1].final[0]  # of the seed that did not
 
 
-@pytest.mark.slow
 def test_seeds_of_one_member_stop_and_the_others_go_on(swept, tmp_path):
     given = ["algo.lr=0.01,1e30", "algo.tau=0.01", "seeds=2", "on_divergence=stop_seed"]
     assert sweep.main([*TINY, *given, f"out={tmp_path}", "name=stops"]) == 0
@@ -172,7 +172,6 @@ def test_a_sweep_that_diverged_everywhere_is_reported(swept, tmp_path):
         assert [row["diverged"] for row in csv.DictReader(file)] == ["2"] * 4
 
 
-@pytest.mark.slow
 def test_stopped_and_resumed_it_is_the_same_sweep(swept, tmp_path, monkeypatch, capsys):
     """A signal after the third interval; it is resumed, to the same numbers."""
     advance, calls = TrainingSession.advance, []
@@ -193,7 +192,6 @@ def test_stopped_and_resumed_it_is_the_same_sweep(swept, tmp_path, monkeypatch, 
     assert not (tmp_path / "cut" / "batches" / "0").exists()  # its checkpoints, replays in them, are of no more use
 
 
-@pytest.mark.slow
 def test_batches_are_jobs_of_their_own_and_cut_by_memory(swept, tmp_path, monkeypatch, capsys):
     """With memory for two seeds: two batches, trained apart, the same table in the end. What one process works at,
     another leaves alone."""
@@ -247,7 +245,6 @@ def test_more_seeds_train_only_what_is_missing(swept, tmp_path, monkeypatch):
     assert len(trained) == 1
 
 
-@pytest.mark.slow
 def test_a_launcher_trains_nothing_that_is_finished(swept, capfd):
     """Hydra starts the jobs, in folders of the sweep's own."""
     assert launcher.launch(swept, 1, "basic", []) == 0

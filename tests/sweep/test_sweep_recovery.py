@@ -17,6 +17,8 @@ from matd3_jax.sweep.runner import Sweep
 from matd3_jax.training import checkpoint
 from matd3_jax.training.recording import Recorder
 
+pytestmark = pytest.mark.slow
+
 TINY = [
     "env=point_reach", "algo=iddpg", "algo.hidden=[4]", "batch_size=8", "num_envs=2", "learning_starts=100",
     "replay_capacity=200", "total_steps=200", "log_every=50", "eval_every=0",

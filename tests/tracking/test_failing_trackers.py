@@ -14,6 +14,8 @@ from matd3_jax.tracking import process
 from matd3_jax.tracking.logger import TrackingLogger
 from matd3_jax.tracking.messages import FAILED, FINISHED, Closed, Logged, TrackedRun
 
+pytestmark = pytest.mark.slow
+
 ROW = {"step": np.array([100]), "seed": np.array([3]), "return_agents": np.array([1.5])}
 SETTINGS = {"logger_seeds": "runs", "wandb": {"project": None, "entity": None, "mode": None}}
 

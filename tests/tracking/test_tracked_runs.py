@@ -31,7 +31,10 @@ def missing(*packages: str) -> list[str]:
     return [name for name in packages if importlib.util.find_spec(name) is None]
 
 
-pytestmark = pytest.mark.skipif(bool(missing("wandb", "mlflow")), reason="needs the packages wandb and mlflow")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(bool(missing("wandb", "mlflow")), reason="needs the packages wandb and mlflow"),
+]
 
 
 @pytest.fixture(scope="module")

@@ -49,6 +49,7 @@ def columns(path):
     return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
 
 
+@pytest.mark.slow
 def test_it_is_the_best_of_all_evaluations_and_its_networks_are_those_of_then(whole):
     table = columns(whole)
     steps = checkpoint.steps(whole / "checkpoints")
@@ -77,6 +78,7 @@ def test_the_standard_error_is_that_of_the_episodes(whole):
     assert one.standard_error == pytest.approx(np.sqrt(returns.var(ddof=1) / 4), rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [0, 2])
 def test_a_killed_run_comes_to_the_same_files(copy, whole, place):
     step = checkpoint.steps(whole / "checkpoints")[place]

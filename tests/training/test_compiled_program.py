@@ -68,6 +68,7 @@ def in_loops(found):
     return reached
 
 
+@pytest.mark.slow
 def test_replay_is_never_copied_in_the_loop(compiled):
     """Nothing in the loop gives out an array of the replay's size but writes in place: no copy, select, scatter (what
     `cond` and `vmap` make of a conditional or a batched write), nor a fusion around one. 200 MB an iteration
@@ -95,6 +96,7 @@ def test_memory(trainer, compiled):
     assert memory.temp_size_in_bytes < trainer.replay_bytes / 3
 
 
+@pytest.mark.slow
 def test_one_compilation_and_donation(trainer):
     """An interval is compiled with its first call and never again, though states come from `init`, `warm-up` and from
     itself; each state given in is gone after it, in every leaf."""

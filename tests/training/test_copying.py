@@ -49,6 +49,7 @@ def same(one, other):
     return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one, other, strict=True))
 
 
+@pytest.mark.slow
 def test_networks_are_copied_and_what_a_seed_lives_in_stays(session, trained):
     sources = {1: 3, 4: 0}  # to the other device and back; 4 is the last one, which has a copy
     found = host(Copier(session.trainer).copy(device(session, trained), sources))

@@ -12,6 +12,8 @@ from matd3_jax import config
 from matd3_jax.training import cost
 from matd3_jax.training.session import TrainingSession
 
+pytestmark = pytest.mark.slow
+
 SMALL = ("total_steps=2000", "replay_capacity=200", "learning_starts=100", "batch_size=16", "seeds=2")
 ANT = ("env=ant", "num_envs=1", "rollout_length=1", "updates_per_collect=1", "algo.hidden=[400,300]")
 WIDE = ("num_envs=20", "rollout_length=1", "updates_per_collect=2", "algo.hidden=[128,128]")

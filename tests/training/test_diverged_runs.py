@@ -24,6 +24,8 @@ from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.sharding import SeedSharding
 from matd3_jax.training.state import networks_finite
 
+pytestmark = pytest.mark.slow
+
 SMALL = [
     "env=point_reach", "algo=iddpg", "seeds=3", "seed=4", "total_steps=1200", "learning_starts=400", "num_envs=4",
     "rollout_length=5", "batch_size=32", "replay_capacity=800", "algo.hidden=[8]", "log_every=200", "eval_every=400",
@@ -51,7 +53,6 @@ def table(path):
         return [row for row in csv.DictReader(file) if int(row["seed"]) != LOST]
 
 
-@pytest.mark.slow
 def test_a_seed_that_diverges_is_reported_and_left_out(blown, tmp_path, monkeypatch, capsys):
     said, path = [], tmp_path / "run"
     recorded = Recorder(say=said.append).start(config.load(SMALL), path)
@@ -164,7 +165,6 @@ def test_stop_seed_keeps_the_networks_from_before_the_updates(blown, together, m
         assert all(nothing) if number > first or number == 0 else not any(nothing[:2])
 
 
-@pytest.mark.slow
 def test_a_seed_that_has_stopped_is_reported_once_and_survives_a_resume(blown, tmp_path, capsys):
     given = [*SMALL, f"out={tmp_path}", "name=run", "on_divergence=stop_seed", "checkpoint_every=400"]
     assert train.main([*given, "keep_checkpoints=9"]) == 0
@@ -229,7 +229,6 @@ def test_from_python_it_is_a_warning(blown):
     assert result.diverged[LOST] == step[~np.isfinite(losses[1]) & (result.metrics["updates"][1] > 0)][0]
 
 
-@pytest.mark.slow
 def test_networks_that_no_loss_shows(tmp_path):
     """A weight of -inf before a ReLU leaves outputs finite."""
     settings = config.load(SMALL)

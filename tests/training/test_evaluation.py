@@ -64,6 +64,7 @@ def play(layout, groups, seed, number):
             return total, x[1]
 
 
+@pytest.mark.slow
 def test_episodes_by_hand():
     """Every episode of the trained policies played again in NumPy: its whole return (nothing after its end), its
     length, and the measures' means over its steps."""
@@ -156,6 +157,7 @@ def test_compiled_once():
     assert after == {(EPISODES, True): 1, (5, False): 1}
 
 
+@pytest.mark.slow
 def test_training_does_not_depend_on_evaluation(monkeypatch):
     """Without evaluations (none is compiled then) and with one after every interval: the same table and state, bit for
     bit."""

@@ -53,6 +53,7 @@ def filmed(tmp_path_factory) -> tuple[Path, Noted, list[str]]:
     return path, noted, [str(one.message) for one in caught if "goes on" in str(one.message)]
 
 
+@pytest.mark.slow
 def test_a_film_at_each_interval_that_passes_a_multiple(filmed):
     path, _, _ = filmed
     assert sorted(int(found.stem) for found in (path / "videos").iterdir()) == [250, 550]
@@ -128,6 +129,7 @@ def test_without_opengl_one_warning(tmp_path, monkeypatch):
     assert not (tmp_path / "videos").exists()
 
 
+@pytest.mark.slow
 def test_runs_of_a_sweep_are_filmed_each_by_its_own_setting(tmp_path):
     given = [f"{key}={value}" for key, value in {**SMALL, "seeds": 1}.items()]
     settings = {

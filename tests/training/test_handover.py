@@ -16,6 +16,8 @@ from matd3_jax.training import checkpoint, handover, starting
 from matd3_jax.training.recording import Recorder
 from matd3_jax.training.session import TrainingSession
 
+pytestmark = pytest.mark.slow
+
 SMALL = [
     "num_envs=2", "rollout_length=2", "batch_size=8", "learning_starts=100", "replay_capacity=400", "log_every=100",
     "total_steps=200", "eval_every=0", "shared_minibatch=false", "n_step=1", "recipe=paper", "algo.policy_delay=1",

@@ -19,6 +19,8 @@ from matd3_jax.training import checkpoint, hybrid
 from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.train import train as train_here
 
+pytestmark = pytest.mark.slow
+
 TINY = [
     "env=simple_adversary", "algo=hybrid", "adversary=maddpg", "algo.hidden=[6]", "adversary.hidden=[5]",
     "batch_size=16", "num_envs=2", "rollout_length=5", "learning_starts=200", "replay_capacity=500", "log_every=100",

@@ -20,6 +20,8 @@ from matd3_jax.training.evaluator import Evaluator
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.schedule import Schedule
 
+pytestmark = pytest.mark.slow
+
 MATD3 = Algorithm(hidden=(4,))
 MADDPG = Algorithm(name="maddpg", hidden=(4,), num_critics=1, policy_delay=1)
 SCHEDULE = Schedule(num_envs=3, rollout_length=4, batch_size=8, replay_capacity=60, learning_starts=36)
@@ -263,7 +265,6 @@ def same(one, other, seeds_one, seeds_other):
     assert one.rollouts == other.rollouts
 
 
-@pytest.mark.slow
 def test_seed_alone():
     """Seed 1 with its own hyper-parameters by itself gives what it gives among three."""
     trainer = make([1], tau=1.0)
@@ -274,7 +275,6 @@ def test_seed_alone():
     assert np.abs(first - second).max() > 1e-3, "the seeds themselves differ"
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(len(jax.devices()) < 2, reason="one device")
 def test_devices_and_pieces_and_chunks_and_unrolling():
     """An odd number of seeds on one device, updated together, in one long interval whose loops hold several iterations
@@ -289,7 +289,6 @@ def test_devices_and_pieces_and_chunks_and_unrolling():
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), plain(long), short)
 
 
-@pytest.mark.slow
 def test_seeds_apart(monkeypatch):
     """Networks of each seed in arrays of their own inside the program, as for large ones: the same numbers, in the same
     form."""
@@ -304,7 +303,6 @@ def test_seeds_apart(monkeypatch):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), plain(long), short)
 
 
-@pytest.mark.slow
 def test_devices_that_share_a_seed():
     """One seed on two devices, half of each minibatch on each: as on one, and the same on both devices."""
     trainer = make([1], dataclasses.replace(SCHEDULE, batch_size=6), tau=1.0)

@@ -25,6 +25,8 @@ from matd3_jax.training import checkpoint
 from matd3_jax.training.recording import Recorder
 from matd3_jax.training.session import TrainingSession
 
+pytestmark = pytest.mark.slow
+
 SMALL = [
     "env=point_reach", "algo=iddpg", "seeds=2", "total_steps=1200", "learning_starts=400", "num_envs=4",
     "rollout_length=5", "batch_size=32", "replay_capacity=800", "algo.hidden=[8]", "log_every=200", "eval_every=400",
@@ -284,7 +286,6 @@ class Empty(Environment):
         return INNER.observe(state[0])
 
 
-@pytest.mark.slow
 def test_from_python_with_an_environment_of_ones_own_whose_state_has_an_empty_array(tmp_path):
     """The directory is the command's; resumed it gives the unbroken run's numbers."""
     small = dict(text.split("=") for text in SMALL if not text.startswith(("env=", "algo", "total_steps")))

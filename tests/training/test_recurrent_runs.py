@@ -20,6 +20,8 @@ from matd3_jax.training import checkpoint, starting
 from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.session import TrainingSession
 
+pytestmark = pytest.mark.slow
+
 GRU = ["algo.actor=gru", "algo.gru_units=5", "sequence_length=4", "burn_in=2"]
 TINY = [
     "env=simple_adversary", "env.episode_length=7", *GRU, "adversary=maddpg", "algo.hidden=[6]", "adversary.hidden=[5]",

@@ -23,6 +23,8 @@ from matd3_jax.training.loop import TrainLoop
 from matd3_jax.training.recording import Recorder
 from matd3_jax.training.session import TrainingSession
 
+pytestmark = pytest.mark.slow
+
 TINY = [
     "env=simple_adversary", "seeds=2", "algo.hidden=[8]", "batch_size=16", "num_envs=2", "learning_starts=200",
     "replay_capacity=500", "total_steps=600", "log_every=100", "eval_every=300", "eval_episodes=2",
@@ -217,7 +219,6 @@ def test_each_way_is_a_program_of_its_own():
     assert plain != kind and plain != team and kind != team
 
 
-@pytest.mark.slow
 def test_a_sweep_over_it_is_two_programs(tmp_path):
     assert sweep.main([*SHORT, "algo.share_parameters=none,kind", f"out={tmp_path}", "name=two"]) == 0
     assert [len(batch) for batch in Sweep(tmp_path / "two").batches] == [1, 1]
@@ -243,7 +244,6 @@ def test_what_cannot_be_is_one_line(words, tmp_path, monkeypatch, capsys):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "more",
     [
@@ -266,7 +266,6 @@ def test_it_goes_with_other_settings(more):
     assert training.finite(state).all() and set(row) == set(training.columns)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("more", [[KIND], [TEAM, KIND]], ids=" ".join)
 def test_two_devices_learn_from_a_minibatch_what_one_does(more):
     """One seed: each device has half of the minibatch, and gradients are averaged."""
@@ -286,7 +285,6 @@ def test_two_devices_learn_from_a_minibatch_what_one_does(more):
     assert np.mean(np.concatenate([part.ravel() for part in far])) < 0.01
 
 
-@pytest.mark.slow
 def test_a_team_of_several_kinds_with_one_set_of_critics(tmp_path):
     """The second kind's group has no critics, but a best policy and a place in what other runs begin with."""
     lines = ["env=simple_speaker_listener", *TINY[1:], TEAM]

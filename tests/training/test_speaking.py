@@ -37,6 +37,7 @@ def trained(name):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_played_is_what_is_heard(name):
     """Every stored action is valid part by part, and the word in it stands in the listeners' next observation."""
@@ -99,6 +100,7 @@ class Telling(Environment):
         return TimeStep(state, self.observe(state), reward[None], jnp.bool_(True), jnp.bool_(False))
 
 
+@pytest.mark.slow
 def test_move_and_word_are_learnt():
     """Each is the right one for what is seen, and nearly surely; at first no word is more than likely."""
     # Actors slow against the critics: none is sure of a choice before the values are there.

@@ -17,6 +17,8 @@ from matd3_jax.training import best, checkpoint, starting
 from matd3_jax.training.recording import Recorder
 from matd3_jax.training.session import TrainingSession
 
+pytestmark = pytest.mark.slow
+
 ENV = ["env=simple_adversary"]
 SMALL = [
     "num_envs=4", "rollout_length=5", "batch_size=16", "learning_starts=200", "replay_capacity=400", "eval_episodes=2",
@@ -118,7 +120,6 @@ def test_it_plays_as_in_its_own_run(fighting, source):
     np.testing.assert_allclose(found, last, rtol=1e-4)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("left", ["nothing but its settings", "its second checkpoint"])
 def test_a_killed_run_comes_to_the_same_bits_without_its_source(copy, fighting, left):
     (copy / "summary.json").unlink()
@@ -132,7 +133,6 @@ def test_a_killed_run_comes_to_the_same_bits_without_its_source(copy, fighting, 
     assert_same_run(copy, fighting)
 
 
-@pytest.mark.slow
 def test_commands_play_it(fighting, tmp_path, capsys):
     assert evaluate.main([f"run={fighting}", "episodes=2", "checkpoint=best"]) == 0
     assert crossplay.main([f"runs={fighting}", "episodes=2", f"out={tmp_path / 'out'}", "checkpoint=best"]) == 0
@@ -165,7 +165,6 @@ def test_agents_may_be_the_frozen_ones(source):
             np.testing.assert_array_equal(given[path][seed], kept.policies[path])
 
 
-@pytest.mark.slow
 def test_critics_judged_beside_a_frozen_team(source):
     """Overestimation is that of the learners alone."""
     lines = ["diagnostics.q_bias=true", "diagnostics.q_bias_rollouts=4", "diagnostics.q_bias_steps=3", "seeds=1"]
@@ -175,7 +174,6 @@ def test_critics_judged_beside_a_frozen_team(source):
     assert set(row) == set(training.columns)
 
 
-@pytest.mark.slow
 def test_runs_of_a_sweep_play_against_it(source, tmp_path, capsys):
     argv = [*AGAINST, f"adversary.policy={source}", "algo.lr=0.01,0.001", f"out={tmp_path}", "name=two", "seeds=1"]
     assert sweep.main([text for text in argv if text != "seeds=3"]) == 0
@@ -243,7 +241,6 @@ def test_of_the_best_evaluations_come_the_actors(source):
                 np.testing.assert_array_equal(given[path.format(part)][1], kept.policies[path.format("actor")])
 
 
-@pytest.mark.slow
 def test_a_run_goes_on_from_where_the_other_was(source, tmp_path):
     """Its first row is what the source's policies get; killed before its first checkpoint it begins with them again."""
     settings = beginning(source).config

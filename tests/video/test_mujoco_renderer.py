@@ -144,6 +144,7 @@ command.run(lambda argv: frames.drawing_of(env))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("variables", "wanted"),
     [
@@ -168,6 +169,7 @@ def test_real_robots_show_every_agent(gl, name):
         assert hue(image, mujoco_renderer.agent_color(agent)).sum() > 100, agent
 
 
+@pytest.mark.slow
 def test_an_opengl_that_mujoco_does_not_know_is_one_line_of_the_command(tmp_path):
     """Here MuJoCo cannot even be imported, hence the environment not be made."""
     config.write(config.load(["env=brax_hopper"]), tmp_path / "config.yaml")
