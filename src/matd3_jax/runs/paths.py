@@ -22,15 +22,29 @@ def paths(texts: Sequence[str], key: str = "runs") -> tuple[Path, ...]:
     directories that match, in alphabetical order. What is between the commas is taken as it is, so that directories may
     be called 1e3 or lr=0.01; one with a comma or brackets goes in quotation marks.
 
-    Raises UserError where a name is empty, and where nothing matches.
+    Raises UserError where a name is empty or no file can have it, a quotation mark is missing, or nothing matches.
     """
     found: list[Path] = []
     for text in texts:
-        for name in lists.split(text):
+        try:
+            names = lists.split(text)
+        except UserError as error:
+            raise UserError(f"{key}: {error}") from error
+        for name in names:
             if not name:
                 raise UserError(f"cannot read {f'{key}={text}'!r}: write directories with commas between, {key}=A,B")
-            found += _matching(Path(name).expanduser(), key)
+            if not _has_bytes(name):
+                raise UserError(f"{key}={name!r}: no file can have this name")
+            found += _matching(_from_home(name), key)
     return tuple(found)
+
+
+def _from_home(name: str) -> Path:
+    """A path with `~` or `~user` at its beginning; as it is where nobody has that name, as a shell leaves it."""
+    try:
+        return Path(name).expanduser()
+    except RuntimeError:
+        return Path(name)
 
 
 def is_name(value: object) -> bool:
