@@ -29,7 +29,7 @@ FULL = {"xla_backend_optimization_level": 3, "xla_llvm_disable_expensive_passes"
 """What programs compile with outside of the tests."""
 
 WORKERS = 4
-"""At most: each needs up to 3 GB."""
+"""At most: each needs up to 3.5 GB."""
 
 KEPT_BYTES = 2 * 2**30
 """Of a worker, above which it forgets its programs between files; most of them no other file runs."""
@@ -89,7 +89,7 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Never look again for garbage among what the imports left: a collection takes half as long."""
+    """Never look again for garbage among what the imports left."""
     gc.collect()
     gc.freeze()
 
