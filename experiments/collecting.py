@@ -68,6 +68,16 @@ class Data:
         self.rows[label], self.facts[label] = rows, facts
         return True
 
+    def adopt(self, other: "Data", wanted: Mapping[str, Config]) -> bool:
+        """Take finished rows of another study of wanted settings whose seeds are missing. Whether any were taken."""
+        taken = False
+        for label, settings in wanted.items():
+            for name, fact in other.facts.items():
+                same = not differences(fact["settings"], settings.to_dict())
+                if same and not other.unfinished(name) and self.missing(label, settings):
+                    taken |= self.offer(label, other.rows[name], fact)
+        return taken
+
     def has(self, label: str, wanted: Config) -> bool:
         """Whether there are finished data of these settings with all these seeds."""
         return not self.missing(label, wanted)

@@ -3,7 +3,8 @@
 The future work of the paper: a robot's agents learn by MATD3 until three tenths of the env steps, then one agent in
 their place goes on by TD3. Beside it MATD3 and TD3 alone, TD3 also with networks as wide as the hybrid's. All with the
 same recipe. With MATD3 the hybrid is compared seed by seed where the two are the same run until the switch. `env` is
-any robot; scale=small is the half-cheetah, 200,000 env steps of five seeds.
+any robot; scale=small is the half-cheetah, 200,000 env steps of five seeds. What `experiments.ant` has trained with the
+same settings is taken over.
 """
 
 import dataclasses
@@ -158,6 +159,7 @@ STUDY = study.of_evaluations(
     details=details,
     options=HybridOptions,
     folders=folders,
+    beside=lambda options: (options.robot,),
 )
 
 

@@ -10,6 +10,7 @@ from experiments import evaluations, figures, study, verdict
 from experiments.study import StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
+from matd3_jax import config
 from matd3_jax.figures.style import SERIES
 from matd3_jax.stats.text import seeds
 
@@ -39,9 +40,7 @@ class OneAtATime:
     def settings(self, scale: str, options: StudyOptions) -> dict[str, list[str]]:
         lines = {}
         for name, changes in self.changes.items():
-            changed = {change.split("=")[0] for change in changes}
-            kept = [line for line in self.common(scale) if line.split("=")[0] not in changed]
-            lines[label(name)] = [*kept, *changes]
+            lines[label(name)] = config.merge(self.common(scale), changes)
         return lines
 
     def parts(self, table: Table) -> dict[str, Table]:

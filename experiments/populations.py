@@ -21,6 +21,7 @@ from experiments.estimating import Batch, Estimator
 from experiments.populations_data import METRIC, RANDOM, Data, best, compared, label, median_interval, ratios
 from experiments.study import RESULTS
 from experiments.verdict import Claim, Difference
+from matd3_jax import config
 from matd3_jax.cli import catalog, command, sweep
 from matd3_jax.cli.options import Command, option, others
 from matd3_jax.errors import UserError
@@ -135,16 +136,17 @@ def arguments(task: str, method: str, options: PopulationOptions) -> list[str]:
     line = [*TASKS[task], f"samples={members}", f"seeds={populations}", f"total_steps={steps}", f"metric={METRIC}"]
     line += [f"log_every={every}", f"eval_every={every}", *METHODS[method]]
     line += [f"pbt_every={every}"] if METHODS[method] else []
-    return [*(text for text in line if text.split("=")[0] not in _keys(options)), *options.overrides]
+    _check(options.overrides)
+    return config.merge(line, options.overrides)
 
 
-def _keys(options: PopulationOptions) -> set[str]:
-    keys = {text.split("=")[0] for text in options.overrides}
-    swept = {text.split("=")[0] for line in TASKS.values() for text in line if "interval(" in text}
+def _check(overrides: Sequence[str]) -> None:
+    """Raise UserError for an override of what the experiment sets."""
+    swept = {text.partition("=")[0] for line in TASKS.values() for text in line if "interval(" in text}
     own = {"seeds", "total_steps", "log_every", "eval_every", "name", "out", *swept}
-    if keys & own:
-        raise UserError(f"cannot take {min(keys & own)}= here: the experiment sets it itself")
-    return keys
+    for override in config.parse(overrides):
+        if override.key_or_group in own:
+            raise UserError(f"cannot take {override.key_or_group}= here: the experiment sets it itself")
 
 
 def batch(key: tuple[str, str], line: Sequence[str]) -> Batch:

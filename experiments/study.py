@@ -78,6 +78,8 @@ class Study:
         check: raises UserError for options that do not go together.
         folders: (options) -> name of the folders under runs/experiments and experiments/results; default: NAME,
             NAME_small.
+        beside: (options) -> names of other studies' folders beside the results, whose rows of the same settings are
+            taken over.
         data, figure: names of those files.
     """
 
@@ -96,6 +98,7 @@ class Study:
     options: type[StudyOptions] = StudyOptions
     check: Callable[[Any], None] = lambda options: None
     folders: Callable[[Any], tuple[Path, Path]] | None = None
+    beside: Callable[[Any], Sequence[str]] = lambda options: ()
     data: str = "data.csv"
     figure: str = "figure.png"
 
@@ -136,6 +139,7 @@ class Plan:
         out: where the results are.
         wanted: the settings by label.
         missing: what of them is to be trained: by name of a run (label, seeds) the label and the settings.
+        adopted: whether `data` has rows of another study that are not written yet.
     """
 
     options: Any
@@ -144,6 +148,7 @@ class Plan:
     data: Data
     wanted: dict[str, Config]
     missing: dict[str, tuple[str, Config]]
+    adopted: bool
 
     @property
     def settings(self) -> dict[str, Config]:
@@ -170,6 +175,8 @@ class Plan:
         devices.prepare()
         wanted = _wanted(study, options)
         data = collecting.read(*_files(study, out), study.keys)
+        others = [collecting.read(*_files(study, out.parent / name), study.keys) for name in study.beside(options)]
+        adopted = any([data.adopt(other, wanted) for other in others])
         missing: dict[str, tuple[str, Config]] = {}
         if options.train:
             chosen = [label for label in wanted if fnmatch.fnmatch(label, options.only or "*")]
@@ -180,7 +187,7 @@ class Plan:
             for name, (_, settings) in missing.items():
                 if (folder / "runs" / name / "config.yaml").exists():
                     collecting.check(folder / "runs" / name, settings)
-        return cls(options, folder, out, data, wanted, missing)
+        return cls(options, folder, out, data, wanted, missing, adopted)
 
 
 def _runs(label: str, wanted: Config, data: Data, at_once: int | None) -> dict[str, tuple[str, Config]]:
@@ -223,6 +230,8 @@ def run(study: Study, argv: Sequence[str]) -> list[Claim] | None:
         out.mkdir(parents=True, exist_ok=True)
         collecting.write(data, *files)
 
+    if plan.adopted:
+        write()
     for settings in plan.rounds():
         trained = runner.train(settings, plan.folder)
         if any([offer(plan.missing[name][0], paths) for name, paths in trained.items()]):
@@ -302,7 +311,7 @@ def _wanted(study: Study, options: StudyOptions) -> dict[str, Config]:
     """The study's settings by label. Raises UserError for overrides that it does not take."""
     overrides = _overrides(options)
     lines = _checked(study, options, overrides)
-    return {label: _load(tuple(_merged(line, overrides))) for label, line in lines.items()}
+    return {label: _load(tuple(config.merge(line, overrides))) for label, line in lines.items()}
 
 
 def _checked(study: Study, options: StudyOptions, overrides: Sequence[str]) -> dict[str, list[str]]:
@@ -317,12 +326,6 @@ def _checked(study: Study, options: StudyOptions, overrides: Sequence[str]) -> d
         if name in varied:
             raise UserError(f"cannot take {name}= here: the study itself varies it (only=PATTERN trains a part)")
     return lines
-
-
-def _merged(line: Sequence[str], overrides: Sequence[str]) -> list[str]:
-    """A setting's overrides, with the user's instead of those for the same keys."""
-    keys = {override.key_or_group for override in config.parse(overrides)}
-    return [*(text for text in line if key(text) not in keys), *overrides]
 
 
 def check_some(studies: Iterable[Study], overrides: Sequence[str]) -> None:

@@ -19,7 +19,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "helpers"))
@@ -48,12 +48,6 @@ ERRORS = slice(8, 14)
 
 UNNOTICED = "changed, without a checksum to notice"
 Outcome = str
-
-
-def merged(usual: Sequence[str], settings: Sequence[str]) -> list[str]:
-    """The usual settings, those for the same keys replaced."""
-    own = {text.split("=")[0] for text in settings}
-    return [*(text for text in usual if text.split("=")[0] not in own), *settings]
 
 
 def resume(path: Path, *more: str) -> list[str]:
@@ -122,10 +116,10 @@ class Torture:
         self.number = 0
 
     def train(self, path: Path) -> list[str]:
-        return ["train", *merged(TRAIN, self.settings), f"out={path.parent}", f"name={path.name}"]
+        return ["train", *config.merge(TRAIN, self.settings), f"out={path.parent}", f"name={path.name}"]
 
     def sweep(self, path: Path, *more: str) -> list[str]:
-        return ["sweep", *merged(SWEEP, self.settings), f"out={path.parent}", f"name={path.name}", *more]
+        return ["sweep", *config.merge(SWEEP, self.settings), f"out={path.parent}", f"name={path.name}", *more]
 
     def close(self) -> None:
         self.process.close()
@@ -387,7 +381,7 @@ def main(argv: list[str]) -> int:
         given = dict(text.split("=", 1) for text in argv)
         minutes, seed = float(given.pop("minutes", 5)), int(given.pop("seed", 0))
         settings = tuple(f"{key}={value}" for key, value in given.items())
-        config.load(merged(TRAIN, settings))
+        config.load(config.merge(TRAIN, settings))
     except (ValueError, UserError) as error:
         raise SystemExit(f"error: {error}; usage: minutes=N, seed=N, settings of all runs") from None
     os.environ.setdefault("JAX_PLATFORMS", "cpu")

@@ -317,3 +317,13 @@ def test_loggers_of_a_run_from_before_the_list(before, now, tmp_path):
 )
 def test_the_table_is_always_among_the_loggers(given, found):
     assert ",".join(config.load([f"logger={given}"]).logger) == found
+
+
+def test_merge_replaces_settings_of_the_same_keys():
+    """However an override is marked, and with several values, as a sweep has them; what it replaces goes."""
+    usual = ["env=ant", "algo.lr=0.1", "env.split='4x2'", "seeds=2", "name=algo.lr=1"]
+    assert config.merge(usual, []) == usual
+    found = config.merge(usual, ["algo.lr=0.01,0.001", "++seeds=3", "env.split=2x4", "tau=1"])
+    assert found == ["env=ant", "name=algo.lr=1", "algo.lr=0.01,0.001", "++seeds=3", "env.split=2x4", "tau=1"]
+    with pytest.raises(UserError, match="cannot read 'algo.lr'"):
+        config.merge(usual, ["algo.lr"])

@@ -1,12 +1,15 @@
 """The report of `experiments.hybrid`: what it says of given runs."""
 
 import csv
+import dataclasses
+import json
+import shutil
 
 import numpy as np
 import pictures
 import pytest
 
-from experiments import hybrid
+from experiments import ant, hybrid
 from matd3_jax import config
 from matd3_jax.runs.directory import RunDirectory
 
@@ -67,6 +70,29 @@ def test_report(runs, tmp_path, monkeypatch):
     axes = figures[out / "curves.png"].axes
     assert [label.split(" (")[0] for label in pictures.lines(axes[0])][:4] == list(hybrid.COLORS)
     np.testing.assert_allclose(pictures.lines(axes[0])["hybrid (2 seeds)"][1], curve("hybrid", np.array(STEPS)))
+
+
+@pytest.mark.parametrize(("steps", "taken"), [(200_000, True), (100_000, False)])
+def test_what_the_ants_study_has_of_the_same_settings_is_taken_over(runs, tmp_path, steps, taken):
+    """MATD3's and TD3's rows come from the folder beside, with what is said of them, and are kept."""
+    out, beside = tmp_path / "results" / "hybrid", tmp_path / "results" / "half_cheetah"
+    for algo in ("matd3", "td3"):  # where `ant` has trained them, for as long or not
+        path = runs / algo
+        settings = config.read(path / "config.yaml")
+        config.write(dataclasses.replace(settings, total_steps=steps), path / "config.yaml")
+    given = ["scale=small", "train=false", "seeds=2"]
+    assert ant.main([*given, f"runs={runs}", f"out={beside}", f"total_steps={steps}", "algos=[matd3,td3]"]) == 0
+    for algo in ("matd3", "td3"):
+        shutil.rmtree(runs / algo)
+    assert hybrid.main([*given, f"runs={runs}", f"out={out}"]) == 0
+    facts = json.loads((out / "runs.json").read_text())
+    shutil.rmtree(beside)
+    assert hybrid.main([*given, f"runs={runs}", f"out={out}"]) == 0
+    assert json.loads((out / "runs.json").read_text()) == facts
+    assert ("matd3" in facts, "td3" in facts, "hybrid" in facts) == (taken, taken, True)
+    assert (out / "table.md").read_text().count("**same**") == (5 if taken else 1)
+    if taken:
+        assert "experiments.ant" in facts["matd3"]["command"] and "experiments.hybrid" in facts["hybrid"]["command"]
 
 
 def test_seeds_are_pairs_where_they_began_alike():

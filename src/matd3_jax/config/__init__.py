@@ -1,7 +1,7 @@
 """Settings of a run: read from files and overrides in Hydra's grammar, typed, and checked before anything starts."""
 
 from matd3_jax.config.file import read, renamed, text, write
-from matd3_jax.config.load import ROBOT_RECIPE, load, parse
+from matd3_jax.config.load import ROBOT_RECIPE, load, merge, parse
 from matd3_jax.config.plain_values import from_dict
 from matd3_jax.config.schema import (
     ADDED_LATER,
@@ -27,6 +27,7 @@ __all__ = [
     "from_dict",
     "known_names",
     "load",
+    "merge",
     "parse",
     "read",
     "renamed",

@@ -139,6 +139,15 @@ def parse(overrides: Sequence[str], sweep: bool = False) -> list[Override]:
     return parsed
 
 
+def merge(settings: Sequence[str], overrides: Sequence[str]) -> list[str]:
+    """Append overrides to settings, and leave out the settings that have their keys.
+
+    Raises UserError where an override is malformed.
+    """
+    keys = {override.key_or_group for override in parse(overrides, sweep=True)}
+    return [*(text for text in settings if text.partition("=")[0] not in keys), *overrides]
+
+
 @functools.cache
 def _parser() -> OverridesParser:
     return OverridesParser.create()
