@@ -134,7 +134,7 @@ def differences(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> dict[str
 
 
 def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
-    whole = {**config.ADDED_LATER, **config.renamed(settings)}
+    whole = config.completed(settings)
     whole["adversary"] = whole.get("adversary") or whole["algo"]
     flat: dict[str, Any] = {}
     for key, value in whole.items():

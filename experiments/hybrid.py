@@ -1,10 +1,11 @@
 """`python -m experiments.hybrid`: whether MATD3 that hands over to TD3 is early like the one and late like the other.
 
 The future work of the paper: a robot's agents learn by MATD3 until three tenths of the env steps, then one agent in
-their place goes on by TD3. Beside it MATD3 and TD3 alone, TD3 also with networks as wide as the hybrid's. All with the
-same recipe. With MATD3 the hybrid is compared seed by seed where the two are the same run until the switch. `env` is
-any robot; scale=small is the half-cheetah, 200,000 env steps of five seeds. What `experiments.ant` has trained with the
-same settings is taken over.
+their place goes on by TD3, with their networks side by side or with networks that have learned from them (distilled).
+Beside it MATD3 and TD3 alone, TD3 also with networks as wide as the joined ones. All with the same recipe. With MATD3
+the hybrid is compared seed by seed where the two are the same run until the switch, and so are the two hybrids. `env`
+is any robot; scale=small is the half-cheetah, 200,000 env steps of five seeds. What `experiments.ant` has trained with
+the same settings is taken over.
 """
 
 import dataclasses
@@ -27,13 +28,14 @@ SHARE = 0.3
 
 STEPS = {"paper": 1_000_000, "small": 200_000}
 SCALES = {"paper": ["seeds=6"], "small": ["seeds=5", "eval_every=10000", "log_every=5000"]}
-KEYS = {"env": "env.name", "algo": "algo.name", "width": "algo.hidden"}
+KEYS = {"env": "env.name", "algo": "algo.name", "width": "algo.hidden", "handover": "algo.handover"}
 
 Curve = tuple[np.ndarray, np.ndarray]
 """(env steps [points], values [seeds, points])."""
 
 COLORS = {name: style.web(color) for name, color in (
-    ("MATD3", style.BLUE), ("hybrid", style.VERMILION), ("TD3", style.PURPLE), ("TD3, as wide", style.SKY_BLUE)
+    ("MATD3", style.BLUE), ("hybrid", style.VERMILION), ("TD3", style.PURPLE), ("TD3, as wide", style.SKY_BLUE),
+    ("hybrid, distilled", style.GREEN),
 )}  # fmt: skip
 
 
@@ -59,14 +61,15 @@ def lines(env: str) -> dict[str, list[str]]:
         "hybrid": ["algo=hybrid"],
         "TD3": ["algo=td3"],
         "TD3, as wide": ["algo=td3", f"algo.hidden=[{wide}]"],
+        "hybrid, distilled": ["algo=hybrid", "algo.handover=distill"],
     }
 
 
 def settings(scale: str, options: HybridOptions) -> dict[str, list[str]]:
     steps, found = STEPS[scale], {}
     for name, line in lines(options.robot).items():
-        switch = [f"switch_at={round(SHARE * steps)}"] if name == "hybrid" else []
-        label = name.replace(", as ", "_").lower()
+        switch = [f"switch_at={round(SHARE * steps)}"] if name.startswith("hybrid") else []
+        label = name.replace(", as ", "_").replace(", ", "_").lower()
         found[label] = [f"env={options.robot}", *line, *switch, f"total_steps={steps}", *SCALES[scale]]
     return found
 
@@ -112,16 +115,22 @@ def claims(table: Table) -> list[Claim]:
                             ("hybrid", late("hybrid")), (name, late(name)), paired=pairs and name == "MATD3")
             for name in ("MATD3", "TD3", "TD3, as wide")
         ),
+        *(
+            verdict.compare(f"The distilled hybrid is better late than {name} (a question of ours)", last,
+                            ("hybrid, distilled", late("hybrid, distilled")), (name, late(name)),
+                            paired=name == "hybrid" and began_alike(curves.get("hybrid, distilled"), curves.get(name)))
+            for name in ("TD3", "hybrid")
+        ),
     ]  # fmt: skip
 
 
-def began_alike(hybrid: Curve | None, matd3: Curve | None) -> bool:
+def began_alike(one: Curve | None, other: Curve | None) -> bool:
     """Whether the evaluations of the same seeds are the same until the switch: those of another machine are not."""
-    if hybrid is None or matd3 is None or len(hybrid[1]) != len(matd3[1]):
+    if one is None or other is None or len(one[1]) != len(other[1]):
         return False
-    steps = np.intersect1d(hybrid[0], matd3[0])
-    steps = steps[steps <= SHARE * matd3[0][-1]]
-    until = [values[:, np.isin(own, steps)] for own, values in (hybrid, matd3)]
+    steps = np.intersect1d(one[0], other[0])
+    steps = steps[steps <= SHARE * other[0][-1]]
+    until = [values[:, np.isin(own, steps)] for own, values in (one, other)]
     return len(steps) > 0 and np.array_equal(*until)
 
 

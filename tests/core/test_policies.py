@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+from scipy.special import rel_entr, softmax
 
 from matd3_jax.core import policies
 from matd3_jax.core.algorithm import Algorithm
@@ -106,6 +107,27 @@ def test_random_actions_and_noise(space):
         spread, noise_mean = 0.5, 0.5772  # an entry between 0 and 1 spreads by a half at most
     assert (np.abs(action.mean(axis=0) - mean) < 5 * spread / np.sqrt(n)).all()
     assert (np.abs(draw.mean(axis=0) - noise_mean) < 5 * 1.29 / np.sqrt(n)).all()
+
+
+@pytest.mark.parametrize("space", [Simplex((5,)), Discrete(4), MultiDiscrete((3, 2))])
+def test_distance_of_choices_is_the_divergence_of_their_probabilities(space):
+    policy = policies.of(space, Algorithm())
+    output, wanted = np.float64(jax.random.normal(jax.random.key(0), (2, 7, space.size)) * 3)
+    total, start = np.zeros(7), 0
+    for size in space.sizes:
+        p, q = (softmax(part[:, start : start + size], axis=-1) for part in (wanted, output))
+        total, start = total + rel_entr(p, q).sum(axis=-1), start + size
+    np.testing.assert_allclose(policy.distance(jnp.float32(output), jnp.float32(wanted)), total, rtol=1e-4)
+    np.testing.assert_array_equal(policy.distance(jnp.float32(wanted), jnp.float32(wanted)), 0)
+
+
+@pytest.mark.parametrize("squash", ["sigmoid", "tanh"])
+def test_distance_of_box_actions_is_in_half_ranges(squash):
+    policy = policies.of(Box(2, -1.0, 3.0), Algorithm(actor_output=squash))
+    output, wanted = jnp.array([[0.5, -1.0], [2.0, 2.0]]), jnp.array([[0.1, 3.0], [2.0, 2.0]])
+    steep = 1.0 if squash == "tanh" else 0.5  # 2 sigmoid(u) - 1 is tanh(u / 2)
+    change = np.tanh(steep * np.float64(output)) - np.tanh(steep * np.float64(wanted))
+    np.testing.assert_allclose(policy.distance(output, wanted), (change**2).mean(axis=-1), rtol=1e-5)
 
 
 def test_to_env():

@@ -17,9 +17,11 @@ STEPS = (0, 10, 20, 30, 40, 50, 60, 70, 80, 90, 100)
 
 
 def curve(name, steps):
-    """MATD3 is early and ends at 50, TD3 late at 90, the hybrid as the one before step 30 and rises to 100."""
+    """MATD3 is early and ends at 50, TD3 late at 90, the hybrids as the one before step 30 and rise to 100 and 110."""
     early, late = np.minimum(2.0 * steps, 50), np.maximum(2.0 * steps - 110, 0)
-    return {"MATD3": early, "TD3": late, "TD3, as wide": late + 1, "hybrid": np.where(steps <= 30, early, steps)}[name]
+    return {"MATD3": early, "TD3": late, "TD3, as wide": late + 1,
+            "hybrid": np.where(steps <= 30, early, steps),
+            "hybrid, distilled": np.where(steps <= 30, early, 1.1 * steps)}[name]  # fmt: skip
 
 
 @pytest.fixture
@@ -46,9 +48,10 @@ def runs(tmp_path):
 def test_settings_differ_in_nothing_but_the_algorithm_and_its_width():
     found = hybrid.settings("small", hybrid.HybridOptions(scale="small"))
     loaded = {label: config.load(line) for label, line in found.items()}
-    assert list(loaded) == ["matd3", "hybrid", "td3", "td3_wide"]
-    assert loaded["hybrid"].switch_at == 60_000 and loaded["hybrid"].total_steps == 200_000
-    assert [one.algo.hidden for one in loaded.values()] == [(128, 128), (128, 128), (128, 128), (256, 256)]
+    assert list(loaded) == ["matd3", "hybrid", "td3", "td3_wide", "hybrid_distilled"]
+    assert [one.switch_at for one in loaded.values()] == [None, 60_000, None, None, 60_000]
+    assert [one.algo.handover for one in loaded.values()] == ["join"] * 4 + ["distill"]
+    assert [one.algo.hidden for one in loaded.values()] == [(128, 128)] * 3 + [(256, 256), (128, 128)]
     assert {(one.seeds, one.total_steps, one.batch_size, one.recipe) for one in loaded.values()} == {
         (5, 200_000, 512, "fast")
     }
@@ -59,16 +62,17 @@ def test_report(runs, tmp_path, monkeypatch):
     out = tmp_path / "out"
     assert hybrid.main(["scale=small", "train=false", f"runs={runs}", f"out={out}", "seeds=2"]) == 0
     with (out / "curves.csv").open(newline="") as file:
-        assert len(list(csv.DictReader(file))) == 4 * 2 * len(STEPS)
+        assert len(list(csv.DictReader(file))) == 5 * 2 * len(STEPS)
     table = (out / "table.md").read_text()
     # Before the switch: the mean of 0, 20, 40, 50 against 0; late: of 70 to 100, against 50 and against 2 s - 110.
     assert (
         "27.5" in table and "| hybrid | 2 | 100 | 100 ± 1 " in table and "| TD3, as wide | 2 | 100 | 91 ± 1 " in table
     )
-    assert table.count("**same**") == 5, table
-    assert table.count(", seed by seed") == 1 and ": hybrid minus MATD3, seed by seed | hybrid 85 " in table
+    assert table.count("**same**") == 7, table
+    assert "hybrid, distilled minus hybrid, seed by seed | hybrid, distilled 93.5 " in table
+    assert table.count(", seed by seed") == 2 and ": hybrid minus MATD3, seed by seed | hybrid 85 " in table
     axes = figures[out / "curves.png"].axes
-    assert [label.split(" (")[0] for label in pictures.lines(axes[0])][:4] == list(hybrid.COLORS)
+    assert [label.split(" (")[0] for label in pictures.lines(axes[0])][:5] == list(hybrid.COLORS)
     np.testing.assert_allclose(pictures.lines(axes[0])["hybrid (2 seeds)"][1], curve("hybrid", np.array(STEPS)))
 
 
@@ -90,7 +94,7 @@ def test_what_the_ants_study_has_of_the_same_settings_is_taken_over(runs, tmp_pa
     assert hybrid.main([*given, f"runs={runs}", f"out={out}"]) == 0
     assert json.loads((out / "runs.json").read_text()) == facts
     assert ("matd3" in facts, "td3" in facts, "hybrid" in facts) == (taken, taken, True)
-    assert (out / "table.md").read_text().count("**same**") == (5 if taken else 1)
+    assert (out / "table.md").read_text().count("**same**") == (7 if taken else 2)
     if taken:
         assert "experiments.ant" in facts["matd3"]["command"] and "experiments.hybrid" in facts["hybrid"]["command"]
 

@@ -425,26 +425,29 @@ def test_processes_begin_with_the_networks_of_another_run(tmp_path, monkeypatch)
 
 @pytest.mark.slow
 def test_a_hybrid_run_of_two_processes_is_that_of_one(tmp_path, monkeypatch):
-    """By itself and in a sweep: each process hands over the networks and the replays of its own seeds."""
+    """By itself with joined networks and in a sweep with distilled ones: each process hands over the networks and the
+    replays of its own seeds."""
     monkeypatch.setattr(runner.Stop, "__init__", lambda self: setattr(self, "signal", None))  # not in threads
     monkeypatch.setattr(ocp, "StandardCheckpointer", OneAtATime)
     small = [*TINY, "algo=hybrid", "algo.policy_delay=1", "eval_every=0", "checkpoint_every=0", "total_steps=600",
              "switch_at=300", "seeds=3"]  # fmt: skip
     settings = config.load(small)
+    distilled = config.load([*small, "algo.handover=distill", "algo.distillation_updates=40", f"out={tmp_path}"])
 
     def work(processes):
         made = runner.Sweep(tmp_path / "sweep", processes)
         if processes.first:
-            made.add({"a": config.load([*small, f"out={tmp_path}"])})
+            made.add({"a": distilled})
         processes.barrier()
         assert made.train() == 0
         return Recorder(processes).start(settings, tmp_path / "of 2").training.seeds.tolist()
 
     assert together(2, work)[0] == [[0, 1], [2]]
-    Recorder().start(settings, tmp_path / "of 1")
-    one = table(tmp_path / "of 1")
-    assert np.isfinite(one["agents_critic_loss"][one["updates"] > 0]).all()
-    for several in (tmp_path / "of 2", tmp_path / "sweep" / "runs" / "a"):
+    for alone, several in ((settings, tmp_path / "of 2"), (distilled, tmp_path / "sweep" / "runs" / "a")):
+        name = alone.algo.handover
+        Recorder().start(alone, tmp_path / name)
+        one = table(tmp_path / name)
+        assert np.isfinite(one["agents_critic_loss"][one["updates"] > 0]).all()
         same_numbers(table(several), one)
         assert json.loads((several / "agents" / "summary.json").read_text())["total_steps"] == 300
 

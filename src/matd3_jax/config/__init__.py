@@ -1,6 +1,6 @@
 """Settings of a run: read from files and overrides in Hydra's grammar, typed, and checked before anything starts."""
 
-from matd3_jax.config.file import read, renamed, text, write
+from matd3_jax.config.file import completed, read, text, write
 from matd3_jax.config.load import ROBOT_RECIPE, load, merge, parse
 from matd3_jax.config.plain_values import from_dict
 from matd3_jax.config.schema import (
@@ -24,13 +24,13 @@ __all__ = [
     "MlflowConfig",
     "ROBOT_RECIPE",
     "WandbConfig",
+    "completed",
     "from_dict",
     "known_names",
     "load",
     "merge",
     "parse",
     "read",
-    "renamed",
     "text",
     "write",
 ]

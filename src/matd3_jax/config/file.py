@@ -27,10 +27,8 @@ def read(path: Path) -> Config:
         found = OmegaConf.to_container(OmegaConf.create(written)) if written.strip() else None
         if not isinstance(found, dict):
             raise UserError("it has no settings")
-        values = _with_defaults(with_logger_list(renamed(found)), ADDED_LATER)
-        env = environment(values)
-        values["env"] = {**OPTIONS_ADDED_LATER.get(env["name"], {}), **env}
-        if "physics" in env:
+        values = completed(found)
+        if "physics" in values["env"]:
             from matd3_jax.envs.robots.engines.engine import RENAMED
 
             physics = values["env"]["physics"]
@@ -52,6 +50,13 @@ def _check_plain(text: str) -> None:
             raise UserError(f"*{event.anchor} refers to another value, which settings do not")
         if depth > DEEPEST:
             raise UserError(f"it has more than {DEEPEST} groups inside each other")
+
+
+def completed(found: Mapping[Any, Any]) -> dict[Any, Any]:
+    """Plain settings of any version under the names that keys have now, with what was in effect where they lack one."""
+    values = _with_defaults(with_logger_list(renamed(found)), ADDED_LATER)
+    env = environment(values)
+    return {**values, "env": {**OPTIONS_ADDED_LATER.get(env["name"], {}), **env}}
 
 
 def renamed(values: Mapping[Any, Any]) -> dict[Any, Any]:

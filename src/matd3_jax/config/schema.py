@@ -66,6 +66,8 @@ class AlgoConfig:
     name: str = setting(SHAPES)
     joint: bool = setting(SHAPES)
     hands_over: bool = setting(SHAPES, before=False)
+    handover: str = setting(SHAPES, choices=("join", "distill"), before="join")
+    distillation_updates: int = setting(SHAPES, least=1, before=10000)
     critic: str = setting(SHAPES, choices=("central", "own", "shared"))
     share_parameters: str = setting(SHAPES, choices=("none", "kind"), before="none")
     num_critics: int = setting(SHAPES, least=1)

@@ -140,6 +140,10 @@ def _check_team(name: str, team: "AlgoConfig", updates: int, need: Any) -> None:
         f"{name}.hands_over=true joins networks that are each agent's own: leave {name}.share_parameters and "
         f"{name}.critic=shared out",
     )
+    need(
+        team.handover == "join" or team.hands_over,
+        f"{name}.handover={team.handover} goes with {'algo' if name == 'algo' else 'adversary'}=hybrid",
+    )
     for key, plain in (("critic_head", "scalar"), ("critic_norm", "none")):
         need(
             not team.hands_over or team.frozen or getattr(team, key) == plain,

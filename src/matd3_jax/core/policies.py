@@ -36,6 +36,10 @@ class Policy(Protocol):
     def shift(self, action: chex.Array, change: chex.Array) -> chex.Array:
         """Actions with `change` added to them, of a Box in half ranges and no further than its bounds."""
 
+    def distance(self, output: chex.Array, wanted: chex.Array) -> chex.Array:
+        """How far the policies of two outputs are apart, [...]: of a Box the mean squared difference of the actions in
+        half ranges, of choices KL(wanted || output), summed over the choices."""
+
     def noise(self, key: chex.PRNGKey, shape: tuple[int, ...]) -> chex.Array:
         """What `sample` takes while exploring, [*shape, size]."""
 
@@ -88,6 +92,9 @@ class DeterministicPolicy:
     def shift(self, action: chex.Array, change: chex.Array) -> chex.Array:
         return self._inside(action + change * self.half)
 
+    def distance(self, output: chex.Array, wanted: chex.Array) -> chex.Array:
+        return jnp.square((self.mode(output) - self.mode(wanted)) / self.half).mean(axis=-1)
+
     def noise(self, key: chex.PRNGKey, shape: tuple[int, ...]) -> chex.Array:
         return flat_draw(jax.random.normal, key, (*shape, self.size))
 
@@ -128,6 +135,13 @@ class CategoricalPolicy:
     def shift(self, action: chex.Array, change: chex.Array) -> chex.Array:
         """Added to the vectors without projecting back, as in the authors' program."""
         return action + change
+
+    def distance(self, output: chex.Array, wanted: chex.Array) -> chex.Array:
+        found = []
+        for part, other in zip(self._parts(output), self._parts(wanted), strict=True):
+            log, other_log = jax.nn.log_softmax(part), jax.nn.log_softmax(other)
+            found.append(jnp.sum(jnp.exp(other_log) * (other_log - log), axis=-1))
+        return sum(found[1:], found[0])
 
     def noise(self, key: chex.PRNGKey, shape: tuple[int, ...]) -> chex.Array:
         return flat_draw(jax.random.gumbel, key, (*shape, self.size))

@@ -191,7 +191,7 @@ class Batch:
             if stop.agreed(self.processes) is not None:
                 return None
         saved = Path(self.processes.broadcast(str(checkpoint.verify(folder)) if first else None))
-        state = hybrid.begin(training, part.training, saved)
+        state = hybrid.begin(training, part.training, saved, say if first else lambda line: None)
         done = training.step(state)  # earlier than the switch where all seeds have diverged and stopped
         for run in self.runs if first else ():
             hybrid.write_table(training, part.training, run)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,7 @@ from matd3_jax.runs.directory import START, RunDirectory
 from matd3_jax.runs.metrics_table import MetricsTable, number
 from matd3_jax.runtime import files
 from matd3_jax.runtime.multihost import Processes
-from matd3_jax.training import checkpoint, handover, saved_replay
+from matd3_jax.training import checkpoint, distillation, handover, saved_replay
 from matd3_jax.training.handover import Team
 from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import TrainState
@@ -56,7 +56,7 @@ def agents_settings(training: TrainingSession, config: Config) -> Config:
         if not team.hands_over or team.frozen:
             return team
         name = "matd3" if team.num_critics > 1 else "maddpg"
-        return dataclasses.replace(team, name=name, joint=False, hands_over=False, critic="central")
+        return dataclasses.replace(team, name=name, joint=False, hands_over=False, handover="join", critic="central")
 
     return dataclasses.replace(
         config,
@@ -78,9 +78,12 @@ def first_session(training: TrainingSession, config: Config) -> TrainingSession:
     return TrainingSession(agents_settings(training, config), innermost(training.env))
 
 
-def begin(training: TrainingSession, agents: TrainingSession, saved: Path) -> TrainState:
+def begin(
+    training: TrainingSession, agents: TrainingSession, saved: Path, tell: Callable[[str], None] = lambda line: None
+) -> TrainState:
     """Go on from the checkpoint `saved` of the agents' part: the same actions, the mean of their values, the same
-    episodes and transitions, and the optimizers' moments."""
+    episodes and transitions, and the optimizers' moments; with `handover=distill` networks that have learned the
+    actions and values, of which `tell` is told."""
     small = checkpoint.restore_actors(saved, agents.trainer, agents.share)
     fresh = training.trainer.init(training.keys())
     there, here = agents.layout, training.layout
@@ -89,6 +92,15 @@ def begin(training: TrainingSession, agents: TrainingSession, saved: Path) -> Tr
         for i, name in enumerate(here.agents)
         if name not in there.agents
     }
+    taught = {i for i in teams if training.config.teams()[here.agents[i]].handover == "distill"}
+    pupils = [g for g, group in enumerate(here.groups) if group.members[0] in taught]
+    side_by_side = dataclasses.replace(
+        here,
+        algorithms=tuple(
+            handover.widened(algorithm, len(teams[i].agents)) if i in taught else algorithm
+            for i, algorithm in enumerate(here.algorithms)
+        ),
+    )
     groups = []
     for group in here.groups:
         each = []
@@ -96,7 +108,7 @@ def begin(training: TrainingSession, agents: TrainingSession, saved: Path) -> Tr
             if i in teams:
                 team = teams[i]
                 own = [_taken(small, there, agent) for agent in team.agents]
-                each.append(handover.networks(f"switch_at={agents.total_steps}", team, own, there, here, i))
+                each.append(handover.networks(f"switch_at={agents.total_steps}", team, own, there, side_by_side, i))
             else:
                 each.append(_taken(small, there, there.agents.index(here.agents[i])))
         found = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *each)
@@ -119,7 +131,7 @@ def begin(training: TrainingSession, agents: TrainingSession, saved: Path) -> Tr
         # A copy: the state is donated, and one buffer can't be given away twice.
         reservoir = reservoir._replace(since=np.array(small.rollouts))
     state = fresh._replace(
-        groups=tuple(groups),
+        groups=tuple(fresh.groups[g] if g in pupils else found for g, found in enumerate(groups)),
         env=env,
         key=small.key,
         rollouts=small.rollouts,
@@ -129,7 +141,14 @@ def begin(training: TrainingSession, agents: TrainingSession, saved: Path) -> Tr
         stopped=small.stopped,
         replay=saved_replay.restore(saved, training.trainer, training.share, int(small.rollouts), order.rows),
     )
-    return jax.device_put(state, training.trainer.shardings)
+    state = jax.device_put(state, training.trainer.shardings)
+    for g in pupils:
+        name = here.agents[here.groups[g].members[0]]
+        teacher = distillation.Teacher(side_by_side.groups[g], groups[g].actor, groups[g].critic)
+        updates = training.config.teams()[name].distillation_updates
+        state, fit = distillation.distill(training.trainer, state, g, teacher, updates)
+        tell(fit.line(name))
+    return state
 
 
 class _Order:

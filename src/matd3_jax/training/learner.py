@@ -69,7 +69,7 @@ class Learner:
                 indices = replay.sample_indices(index_key, places, (batches, drawn))
                 raw = self._drawn(state, hyper, seed, minibatch.own_part(indices, axis, dimension=-1))
                 others = frozen.next_actions(self.layout, states, self._learned(raw))
-                normalized = self._normalized(state, seed, raw)
+                normalized = self.normalized(state, seed, raw)
                 rows, sequences = self._learned(normalized), normalized if self.layout.recurrent else None
                 move = [(first + u + 1) % group.algorithm.policy_delay == 0 for group in groups]
                 how = (schedule.sequential, self.sharding.on_cpu, axis, others, schedule.random_order, sequences)
@@ -123,7 +123,7 @@ class Learner:
         """What updates take: the rows [*indices.shape, row_size] of a local seed and its `hyper`, rewards of n_step
         steps in them, observations normalized; where anybody is recurrent sequences [*indices.shape, steps, row_size],
         `indices` counted from the oldest row."""
-        return self._normalized(state, seed, self._drawn(state, hyper, seed, indices))
+        return self.normalized(state, seed, self._drawn(state, hyper, seed, indices))
 
     def _drawn(
         self, state: TrainState, hyper: Sequence[HyperParams], seed: chex.Array | int, indices: chex.Array
@@ -140,7 +140,7 @@ class Learner:
         gamma = jnp.stack([jnp.asarray(hyper[layout.place(i)[0]].gamma) for i in range(layout.num_agents)])
         return n_step.draw(layout, state.replay, seed, indices, written, schedule.num_envs, gamma)
 
-    def _normalized(self, state: TrainState, seed: chex.Array | int, rows: chex.Array) -> chex.Array:
+    def normalized(self, state: TrainState, seed: chex.Array | int, rows: chex.Array) -> chex.Array:
         """Replay rows [..., row_size] of a local seed with x and x' as networks see them."""
         scale = self.scale(state)
         if scale is None:

@@ -121,7 +121,7 @@ class TrainLoop:
     @property
     def shardings(self) -> TrainState:
         """Sharding of each field of the state (a prefix tree)."""
-        return jax.tree.map(self.sharding.named, self._specs)
+        return jax.tree.map(self.sharding.named, self.specs)
 
     # ---- programs ----------------------------------------------------------------------------------------------------
 
@@ -159,7 +159,7 @@ class TrainLoop:
     def _init(self) -> Callable:
         settings = self.env, self.layout, self.schedule.num_envs, self.normalize_observations
         begin = partial(initial, *settings, self.q_bias_pairs, self.earlier_statistics, self.stop_seeds)
-        return self.sharding.sharded(begin, P("seeds"), self._specs)
+        return self.sharding.sharded(begin, P("seeds"), self.specs)
 
     @cached_property
     def _compiled_init(self) -> Callable:
@@ -168,7 +168,8 @@ class TrainLoop:
         return jax.jit(self._init, compiler_options=quick if self.on_cpu else None)
 
     @property
-    def _specs(self) -> TrainState:
+    def specs(self) -> TrainState:
+        """Along which axis of the mesh each field of the state is divided (a prefix tree)."""
         there = self.normalize_observations, self.q_bias_pairs > 0, self.earlier_statistics, self.stop_seeds
         return prefix(P("seeds"), P(), *there)
 
@@ -258,5 +259,5 @@ class TrainLoop:
                 state = state._replace(groups=stack(state.groups))
             return state, jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), outputs)
 
-        specs = (self._specs, P("seeds"))
+        specs = (self.specs, P("seeds"))
         return Program(jax.jit(self.sharding.sharded(repeat, specs, specs), donate_argnums=0), self.hyper, iterations)

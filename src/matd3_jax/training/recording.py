@@ -167,7 +167,7 @@ class Recorder:
             return Recorded(directory, part_of, outcome)
         del outcome  # its replay
         saved = hybrid.last_checkpoint(directory, self.processes)
-        state = hybrid.begin(training, part_of, saved)
+        state = hybrid.begin(training, part_of, saved, self.say)
         done = training.step(state)  # earlier than the switch where all seeds have diverged and stopped
         if self.processes.first:
             hybrid.write_table(training, part_of, directory)

@@ -40,7 +40,8 @@ def lines(settings: Config) -> list[str]:
     found = []
     if settings.hands_over:
         found.append(
-            "first the agents learn, each with its own networks, then one agent in their place goes on with these"
+            "first the agents learn, each with its own networks, then one agent in their place goes on with "
+            + ("networks that have learned from these" if _distills(settings) else "these")
         )
     if settings.init is not None:
         found.append(
@@ -51,6 +52,10 @@ def lines(settings: Config) -> list[str]:
         if algo.frozen:
             found.append(f"{team} play the policy of {algo.policy} ({_which(algo.policy_checkpoint)}) and do not learn")
     return found
+
+
+def _distills(settings: Config) -> bool:
+    return any(team.handover == "distill" for team in settings.teams().values())
 
 
 def _which(text: str | None) -> str:

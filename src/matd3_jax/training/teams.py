@@ -28,7 +28,7 @@ def joined(config: Config, env: Environment) -> tuple[Environment, dict[str, Alg
     teams = config.teams()
     algorithms = {team: algo.algorithm() for team, algo in teams.items()}
     for team in [team for team in dict.fromkeys(env.teams) if teams[team].joint]:
-        if teams[team].hands_over:
+        if teams[team].hands_over and teams[team].handover == "join":
             algorithms[team] = handover.widened(algorithms[team], env.teams.count(team))
         env = JointTeam(env, (team,), full=not teams[team].hands_over)
     return env, algorithms
