@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter
 
-from experiments import figures
+from experiments import figures, verdict
 from experiments.tidy import Table
 from matd3_jax.figures import style
 from matd3_jax.stats.intervals import Estimate, t_interval
@@ -69,7 +69,7 @@ def row(part: Table) -> list[str]:
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Lines of a Markdown table."""
-    return [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows)]
+    return [verdict.row(cells) for cells in (head, ["---"] * len(head), *rows)]
 
 
 # ---- of several settings by name, in one task ------------------------------------------------------------------------

@@ -94,7 +94,7 @@ def details(table: Table) -> list[str]:
         for algo in ALGOS:
             part = _part(table, env, split, algo)
             if len(part):
-                who = [env, split.replace("|", "\\|"), figures.NAMES[algo]]
+                who = [env, split, figures.NAMES[algo]]
                 rows.append([*who, *evaluations.row(part), harl.get(algo, NOTHING)])
     return evaluations.table(("robot", "split", "algorithm", *evaluations.HEAD, "HARL's"), rows)
 

@@ -177,8 +177,13 @@ def lines(claims: Sequence[Claim]) -> list[str]:
         if claim.difference is not None:
             cells[3], cells[4] = in_words(claim), _p(claim.difference.p)
             cells[5] = _p(corrected[i]) if i in corrected else NOTHING
-        table.append(f"| {' | '.join(cells)} |")
+        table.append(row(cells))
     return table
+
+
+def row(cells: Sequence[str]) -> str:
+    """A row of a Markdown table."""
+    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
 
 
 def in_words(claim: Claim) -> str:

@@ -97,6 +97,7 @@ def test_lines():
         verdict.compare("A is better", "return", ("A", SLEEP[1]), ("B", SLEEP[0])),
         Claim("never tried", "quantity"),
         Claim("better again", "quantity", Difference(1500.0, 1200.0, 1800.0, 0.00002)),
+        Claim("humanoid 9|8", "quantity"),
     ]
     lines = verdict.lines(claims)
     assert lines[2] == (
@@ -105,3 +106,4 @@ def test_lines():
     )
     assert lines[3].endswith("| — | — | — | — | **not yet run** |")
     assert "| +1,500 (1,200 to 1,800) | < 0.0001 | < 0.0001 | **same** |" in lines[4]
+    assert lines[5].startswith("| humanoid 9\\|8 | quantity | — |")  # no column more
