@@ -24,7 +24,8 @@ SMALL = {
     "seeds": 2, "total_steps": 400, "learning_starts": 100, "num_envs": 2, "rollout_length": 5, "batch_size": 16,
     "replay_capacity": 400, "log_every": 100, "eval_every": 200, "eval_episodes": 2,
 }  # fmt: skip
-WORDS = ["env=point_reach", "algo.hidden=[8]", *(f"{key}={value}" for key, value in SMALL.items())]
+NETWORKS = "algo.hidden=[8]", "algo.policy_delay=1"
+WORDS = ["env=point_reach", *NETWORKS, *(f"{key}={value}" for key, value in SMALL.items())]
 
 
 def train(*more: str, **how) -> subprocess.CompletedProcess:
@@ -34,7 +35,7 @@ def train(*more: str, **how) -> subprocess.CompletedProcess:
 
 @pytest.fixture(scope="module")
 def plain():
-    return matd3_jax.train("algo.hidden=[8]", env="point_reach", **SMALL)
+    return matd3_jax.train(*NETWORKS, env="point_reach", **SMALL)
 
 
 MODES = {
@@ -48,7 +49,7 @@ MODES = {
 @pytest.mark.parametrize("mode", MODES)
 def test_modes_of_jax_leave_the_numbers_as_they_are(mode, plain):
     with MODES[mode]():
-        found = matd3_jax.train("algo.hidden=[8]", env="point_reach", **SMALL)
+        found = matd3_jax.train(*NETWORKS, env="point_reach", **SMALL)
         played = found.evaluate(episodes=3)
     assert all(leaf.dtype != np.float64 for leaf in jax.tree.leaves(found.state) if hasattr(leaf, "dtype"))
     for name, column in plain.metrics.items():

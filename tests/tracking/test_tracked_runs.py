@@ -19,7 +19,7 @@ from matd3_jax.training.outputs import Outputs
 TINY = [
     "env=point_reach", "seeds=2", "seed=5", "algo.hidden=[8]", "batch_size=16", "num_envs=2", "learning_starts=100",
     "replay_capacity=500", "total_steps=600", "log_every=100", "eval_every=200", "eval_episodes=2",
-    "checkpoint_every=200", "keep_checkpoints=9",
+    "checkpoint_every=200", "keep_checkpoints=9", "algo.policy_delay=1",
 ]  # fmt: skip
 TRACKED = ["logger=[wandb,mlflow]", "wandb.mode=offline", "video_every=300"]
 COUNTERS = ("step", "seed")
