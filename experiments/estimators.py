@@ -36,6 +36,8 @@ BASE = "minimum of 2"
 """MATD3's."""
 MINIMA = {1: "1 critic", 2: "minimum of 2", 3: "minimum of 3", 5: "minimum of 5"}
 FAMILIES = ("1 critic", "minimum", "REDQ", "TQC")
+MARKERS = ("o", "s", "^")
+"""Of the members of a family, which has one color."""
 
 TASKS = {
     "simple_spread": ["env=simple_spread", "env.episode_length=200"],
@@ -124,13 +126,14 @@ def draw(table: Table, path: Path) -> None:
             over, returns = bias(rows), evaluations.late(rows)
             if over is None or returns is None:
                 continue
-            color = SERIES[next(k for k, family in enumerate(FAMILIES) if name.startswith(family))]
-            figures.cross(axis, 100 * over, returns, color, name)
+            k = next(k for k, family in enumerate(FAMILIES) if name.startswith(family))
+            marker = MARKERS[[other for other in ESTIMATORS if other.startswith(FAMILIES[k])].index(name)]
+            figures.cross(axis, 100 * over, returns, SERIES[k], marker, name)
         axis.axvline(0, color="black", linewidth=0.8)
         axis.set_xlabel("estimate minus true value, % of the true value")
         axis.set_ylabel(QUANTITY)
         axis.set_title(figures.task(task))
-        axis.margins(x=0.25)
+        figures.legend_above(axis, columns=3)
     figures.save(figure, path)
 
 

@@ -79,12 +79,11 @@ def point(axis: Axes, row: float, values: np.ndarray, color: str, offset: float 
     axis.plot(values, np.full(len(values), row + offset), ".", color="black", markersize=3, alpha=0.5)
 
 
-def cross(axis: Axes, x: np.ndarray, y: np.ndarray, color: str, label: str) -> None:
-    """Draw the means of two quantities [seeds] against each other with their 95 % intervals, and a label beside."""
+def cross(axis: Axes, x: np.ndarray, y: np.ndarray, color: str, marker: str, label: str) -> None:
+    """Draw the means of two quantities [seeds] against each other with their 95 % intervals; label: in the legend."""
     (across, width), (up, height) = (mean_interval(values) for values in (x, y))
     bars = {"xerr": width, "yerr": height} if len(x) > 1 else {}
-    axis.errorbar(across, up, fmt="o", color=color, capsize=2, linewidth=1, **bars)
-    axis.annotate(label, (across, up), (4, 4), textcoords="offset points", fontsize=8, color=color)
+    axis.errorbar(across, up, fmt=marker, color=color, capsize=2, linewidth=1, label=label, **bars)
 
 
 def legend_above(axis: Axes, columns: int = 2) -> None:

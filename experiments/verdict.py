@@ -110,10 +110,10 @@ def slope(x: np.ndarray, y: np.ndarray) -> Difference:
     if len(x) < 3 or np.ptp(x) == 0:
         return Difference(np.nan, np.nan, np.nan, np.nan)
     line = stats.linregress(x, y)
-    half = float(stats.t.ppf(0.975, len(x) - 2)) * line.stderr
-    rest = y - line.intercept - line.slope * x
+    slope, half = float(line.slope), float(stats.t.ppf(0.975, len(x) - 2) * line.stderr)
+    rest = y - line.intercept - slope * x
     unit = float(np.sqrt((rest**2).sum() / (len(x) - 2)))
-    return Difference(line.slope, line.slope - half, line.slope + half, float(line.pvalue), unit)
+    return Difference(slope, slope - half, slope + half, float(line.pvalue), unit)
 
 
 def negative(found: Difference) -> Difference:
@@ -190,7 +190,7 @@ def in_words(claim: Claim) -> str:
     """The difference of a claim that has one, with its interval and the claim's margin."""
     d = claim.difference
     assert d is not None
-    text = f"{'+' * (d.estimate > 0)}{number(d.estimate)} ({_interval(d)})"
+    text = f"{'+' if d.estimate > 0 else ''}{number(d.estimate)} ({_interval(d)})"
     return text if claim.kind == "greater" else f"{text}; margin {number(claim.margin)}"
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pictures
 import pytest
 
-from experiments import estimators, evaluations, study, tidy
+from experiments import estimators, evaluations, study, tidy, verdict
 from experiments.study import StudyOptions
 from experiments.tidy import Table
 from matd3_jax import config
@@ -51,6 +51,8 @@ def test_what_is_claimed(table, tmp_path):
     # Biases of 8, 6, 4 and 2 % with 1, 2, 3 and 5 critics: least squares, by hand -13 / 8.75.
     assert claims[0].difference.estimate == pytest.approx(0.13 / 8.75) and claims[0].verdict == "same"
     assert [claim.difference.estimate for claim in claims[1:each]] == pytest.approx([-10, 10, 20, 30, 40, 50, 60])
+    words = verdict.lines(claims)[2]
+    assert "1: +8.0 %, 2: +6.0 %, 3: +4.0 %, 5: +2.0 % | +0.01486 (" in words, words
     rising = made_up({name: 2.0 * k for k, name in enumerate(NAMES)})
     assert estimators.claims(rising)[0].verdict == "opposite"
     assert all(claim.verdict == "not yet run" for claim in estimators.claims(Table({})))
@@ -61,10 +63,12 @@ def test_what_is_claimed(table, tmp_path):
 def test_each_estimator_stands_at_its_bias_and_return(table, written, tmp_path):
     estimators.draw(table, tmp_path / "figure.png")
     for axis in written[tmp_path / "figure.png"].axes:
-        places = {text.get_text(): text.xy for text in axis.texts}
-        assert list(places) == NAMES
-        for k, place in enumerate(places.values()):
-            assert place == pytest.approx((8 - 2 * k, 10 * k + 0.15))
+        assert [text.get_text() for text in axis.get_legend().get_texts()] == NAMES
+        looks = set()
+        for k, (point, _, _) in enumerate(axis.containers):
+            assert point.get_xydata()[0] == pytest.approx((8 - 2 * k, 10 * k + 0.15))
+            looks.add((point.get_color(), point.get_marker()))
+        assert len(looks) == len(axis.containers) == len(NAMES)
 
 
 def test_settings_are_what_their_names_say():
