@@ -1,10 +1,11 @@
 """`python -m experiments.populations`: what population-based training reaches in less compute than random search.
 
 Not in the paper. On Cooperative Navigation and the half-cheetah: random search over the learning rates and tau, and
-population-based training (PBT) of the same draws with the same seeds and as many env steps. Each seed is a population
-of its own. The best member is compared, by deterministic evaluations: when has PBT's what random search's best ends
-with, and when has random search it itself? The quotient of the two numbers of env steps is the compute that PBT needs.
-Whatever is finished is used as it is, so a call that was stopped resumes with the same command.
+population-based training (PBT) of the same draws with the same seeds and as many env steps; on Cooperative Navigation
+also PBT whose selections begin after the first dip of the returns. Each seed is a population of its own. The best
+member is compared, by deterministic evaluations: when has PBT's what random search's best ends with, and when has
+random search it itself? The quotient of the two numbers of env steps is the compute that PBT needs. Whatever is
+finished is used as it is, so a call that was stopped resumes with the same command.
 """
 
 import dataclasses
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib.ticker import EngFormatter
 
 from experiments import estimating, figures, verdict
 from experiments.estimating import Batch, Estimator
@@ -31,8 +33,10 @@ from matd3_jax.runtime import devices, files
 from matd3_jax.runtime.terminal import say
 from matd3_jax.stats.text import number
 
-PBT, WITH_REPLAYS = "PBT", "PBT, replays copied"
-METHODS = {RANDOM: [], PBT: ["pbt=true"], WITH_REPLAYS: ["pbt=true", "pbt_replay=true"]}
+PBT, WITH_REPLAYS, LATER = "PBT", "PBT, replays copied", "PBT, begun later"
+METHODS = {RANDOM: [], PBT: ["pbt=true"], WITH_REPLAYS: ["pbt=true", "pbt_replay=true"], LATER: ["pbt=true"]}
+START = {"simple_spread": 60_000}
+"""Env steps before the first selection of PBT that begins later: after the first dip of the returns."""
 
 TASKS = {
     "simple_spread": [
@@ -102,7 +106,7 @@ def main(argv: Sequence[str]) -> int:
         raise UserError(f"only={options.only}: matches none of {', '.join(TASKS)}")
     devices.prepare()
     data = Data.read(out)
-    wanted = {(task, method): arguments(task, method, options) for task in chosen for method in methods(options)}
+    wanted = {(task, method): arguments(task, method, options) for task in chosen for method in methods(task, options)}
     missing = {key: line for key, line in wanted.items() if data.facts.get(label(*key)) != line}
     if options.estimate:
         estimating.report([batch(key, line) for key, line in missing.items()], Estimator())
@@ -119,8 +123,10 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def methods(options: PopulationOptions) -> list[str]:
-    return [name for name in METHODS if name != WITH_REPLAYS or options.replays]
+def methods(task: str, options: PopulationOptions) -> list[str]:
+    late = (1 - 1 / EVALUATIONS) * size(task, options).steps  # when the last selection comes
+    chosen = {WITH_REPLAYS: options.replays, LATER: START.get(task, np.inf) <= late}
+    return [name for name in METHODS if chosen.get(name, True)]
 
 
 def size(task: str, options: PopulationOptions) -> Size:
@@ -136,6 +142,7 @@ def arguments(task: str, method: str, options: PopulationOptions) -> list[str]:
     line = [*TASKS[task], f"samples={members}", f"seeds={populations}", f"total_steps={steps}", f"metric={METRIC}"]
     line += [f"log_every={every}", f"eval_every={every}", *METHODS[method]]
     line += [f"pbt_every={every}"] if METHODS[method] else []
+    line += [f"pbt_start={START[task]}"] if method == LATER else []
     _check(options.overrides)
     return config.merge(line, options.overrides)
 
@@ -175,7 +182,8 @@ def claims(data: Data) -> list[Claim]:
     found, there = [], compared(data)
     for task in TASKS:
         for method in METHODS:
-            if method == RANDOM or (method == WITH_REPLAYS and (task, method) not in there):
+            asked = method == PBT or (method == LATER and task in START)
+            if method == RANDOM or not (asked or (task, method) in there):
                 continue
             sooner = f"{figures.task(task)}: {method} reaches in less compute what random search reaches (ours)"
             share = "1 minus the ratio of env steps, median over populations"
@@ -246,6 +254,7 @@ def draw(data: Data, path: Path) -> None:
             axis.plot(steps, np.median(curves, axis=0), color=color, label=f"{method} ({len(curves)} populations)")
         axis.set_title(figures.task(task))
         axis.set_xlabel("env steps of each member")
+        axis.xaxis.set_major_formatter(EngFormatter(sep=""))
         axis.set_ylabel("best member's evaluations, last tenth")
         axis.legend(frameon=False, loc="lower right")
     figures.save(figure, path)

@@ -86,7 +86,7 @@ def test_what_is_claimed_and_told(tmp_path, written, capsys):
     assert "| simple_spread | PBT | 3 | 7 | 2,000 | 1,803 | 0.5263 (0.5263 to 0.5263) |" in said
     first, second, *others = populations.claims(again)
     assert first.verdict == "same" and second.difference.estimate == 0
-    assert len(others) == 2 and all(claim.verdict == "not yet run" for claim in others)
+    assert len(others) == 4 and all(claim.verdict == "not yet run" for claim in others)
     assert populations.claims(made_up(0.5))[0].verdict == "opposite"
     few = made_up()
     few.values = {key: values[:5] for key, values in few.values.items()}
@@ -102,9 +102,11 @@ def test_what_is_claimed_and_told(tmp_path, written, capsys):
 def test_methods_differ_in_nothing_else():
     for scale, task in itertools.product(populations.SCALES, populations.TASKS):
         options = PopulationOptions(scale=scale, replays=True)
-        lines = [populations.arguments(task, method, options) for method in populations.methods(options)]
+        lines = [populations.arguments(task, method, options) for method in populations.methods(task, options)]
         plain = [[text for text in line if not text.startswith("pbt")] for line in lines]
         assert plain[0] == plain[1] == plain[2] == lines[0] and len(lines[2]) > len(lines[1]) > len(lines[0])
+        later = [[f"pbt_start={populations.START[task]}"]] if task in populations.START else []
+        assert [[text for text in line if text not in lines[1]] for line in lines[3:]] == later
         of = sweep.catalog.SWEEP.parse(lines[1])
         chosen, settings = sweep.read(of.settings, of.samples, of.sample_seed)
         values = dict(zip(settings, chosen, strict=True))

@@ -234,6 +234,15 @@ def test_the_table_is_read_as_it_was_written(tmp_path):
         Lineage.read(tmp_path / "none.csv")
 
 
+def test_selections_begin_at_the_start():
+    """Every 100 env steps in intervals of 40; a sweep from before there was a start has none."""
+    facts = {"every": 100, "fraction": 0.2, "explore": "perturb", "replay": False, "seed": 0, "overrides": []}
+    for given, wanted in (({}, [120, 200, 320, 400]), ({"start": 200}, [200, 320, 400]), ({"start": 201}, [320, 400])):
+        rules = Rules.of({"pbt": {**facts, **given}, "metric": "return_agents", "settings": {}})
+        assert [step for step in range(40, 441, 40) if rules.due(step - 40, step)] == wanted
+        assert Rules.of({"pbt": rules.facts, "metric": "return_agents", "settings": {}}) == rules
+
+
 # ---- what will not do ------------------------------------------------------------------------------------------------
 
 
@@ -246,6 +255,12 @@ def test_the_table_is_read_as_it_was_written(tmp_path):
         (["algo.lr=0.1,0.2", "pbt=maybe"], "pbt=maybe"),
         (["algo.lr=0.1,0.2", "pbt=true", "pbt_every=551"], "nobody would ever copy: .* the last but one ends at 550"),
         (["algo.lr=0.1,0.2", "pbt=true", "log_every=600"], "nobody would ever copy"),
+        (
+            ["algo.lr=0.1,0.2", "pbt=true", "pbt_every=100", "pbt_start=501"],
+            "pbt_every=100 pbt_start=501: nobody would",
+        ),
+        (["algo.lr=0.1,0.2", "pbt=true", "pbt_start=-1"], "pbt_start=-1"),
+        (["algo.lr=0.1,0.2", "pbt_start=100"], "pbt_start= goes with pbt=true"),
         (["algo.lr=0.1,0.2", "pbt=true", "pbt_fraction=0.6"], "pbt_fraction=0.6"),
         (["algo.lr=0.1,0.2", "pbt=true", "pbt_explore=mutate"], "pbt_explore=mutate"),
         (["algo.policy_delay=1,2", "pbt=true"], "algo.policy_delay=2 is not trained in one program"),

@@ -72,6 +72,9 @@ class Sweep(OfProcesses):
         "between selections of a population", default=None, unit="env steps", least=1,
         otherwise="a twentieth of total_steps",
     )  # fmt: skip
+    pbt_start: int | None = option(
+        "before which there is no selection", default=None, unit="env steps", least=0, otherwise="0"
+    )
     pbt_fraction: float | None = option(
         "of the members that copy, and of those that are copied; at least one", default=None, above=0, most=0.5,
         otherwise="0.2",

@@ -116,7 +116,7 @@ def population_rules(
     Raises UserError for options of populations without one, and for settings that cannot be one.
     """
     if not given.pbt:
-        for name in ("pbt_every", "pbt_fraction", "pbt_explore", "pbt_replay"):
+        for name in ("pbt_every", "pbt_start", "pbt_fraction", "pbt_explore", "pbt_replay"):
             if getattr(given, name) is not None:
                 raise UserError(f"{name}= goes with pbt=true")
         return None
@@ -130,6 +130,7 @@ def population_rules(
         overrides=given.settings,
         metric=metric,
         settings=chosen,
+        start=given.pbt_start or 0,
     )
     population.check(rules, settings)
     return rules

@@ -46,6 +46,7 @@ class Rules:
         overrides: search space and settings, as they were given.
         metric: column of the metrics table by which is selected; the more the better.
         settings: the members' values of the swept keys at the start, by name.
+        start: env steps before which there is no selection (the paper's members are not *ready* before).
     """
 
     every: int
@@ -56,11 +57,16 @@ class Rules:
     overrides: tuple[str, ...]
     metric: str
     settings: Mapping[str, Mapping[str, str]]
+    start: int = 0
+
+    def due(self, before: int, step: int) -> bool:
+        """Whether a selection comes after an interval from env step `before` to `step`."""
+        return step // self.every != before // self.every and step >= self.start
 
     @property
     def facts(self) -> dict[str, Any]:
         """What sweep.json keeps under "pbt"."""
-        own = ("every", "fraction", "explore", "replay", "seed")
+        own = ("every", "fraction", "explore", "replay", "seed", "start")
         return {**{name: getattr(self, name) for name in own}, "overrides": list(self.overrides)}
 
     @classmethod
@@ -142,8 +148,8 @@ class Population:
         """The state after an interval, with copies where a selection is due; row: of the interval, from env step
         `before` on. At the end of the run there is none: it would change what is ranked and nothing would follow."""
         self._note(row)
-        step, every = int(row["step"][0]), self.rules.every
-        if step // every == before // every or step >= self.training.total_steps:
+        step = int(row["step"][0])
+        if not self.rules.due(before, step) or step >= self.training.total_steps:
             return state
         settings, seeds = self.shape
         lost = np.isin(np.arange(settings * seeds), list(self.diverged)).reshape(self.shape)
@@ -253,10 +259,11 @@ def check(rules: Rules, settings: Mapping[str, Config]) -> None:
     session = TrainingSession(settings[first])
     interval = session.interval_steps
     ends = range(session.trainer.schedule.warmup_steps, session.total_steps, interval)  # none at the end of the run
-    if ends[-1] // rules.every == ends[0] // rules.every:
+    if not any(rules.due(before, step) for before, step in zip(ends, ends[1:], strict=False)):
+        which = f"pbt_every={rules.every}" + (f" pbt_start={rules.start}" if rules.start else "")
         raise UserError(
-            f"pbt_every={rules.every}: nobody would ever copy: of the logging intervals of {interval:,} env steps the "
-            f"last but one ends at {ends[-1]:,}"
+            f"{which}: nobody would ever copy: of the logging intervals of {interval:,} env steps the last but one "
+            f"ends at {ends[-1]:,}"
         )
 
 
