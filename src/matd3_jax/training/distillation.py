@@ -48,9 +48,10 @@ class Fit(NamedTuple):
         """One line about the agent `name`: means over the seeds and the last tenth of the updates."""
         last = max(1, self.actor_loss.shape[1] // 10)
         actor, critic, variance = (float(np.mean(part[:, -last:])) for part in self)
+        explained = 100 * (1 - critic / variance) if variance else np.nan
         return (
             f"{name}: fitted to what the agents did in {self.actor_loss.shape[1]:,} updates; actor loss {actor:.2g}, "
-            f"values explain {100 * (1 - critic / variance) if variance else np.nan:.1f} % of theirs' variance"
+            f"values explain {explained:.1f} % of the variance of the agents'"
         )
 
 
