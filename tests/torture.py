@@ -378,6 +378,7 @@ def _same_member(path: Path, whole: Path) -> str:
 def main(argv: list[str]) -> int:
     """Trials for as long as is given; the exit code."""
     try:
+        config.parse([text for text in argv if "=" not in text])  # raises for a word that is no key=value
         given = dict(text.split("=", 1) for text in argv)
         minutes, seed = float(given.pop("minutes", 5)), int(given.pop("seed", 0))
         settings = tuple(f"{key}={value}" for key, value in given.items())

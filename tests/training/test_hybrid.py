@@ -173,8 +173,11 @@ def test_killed_before_its_first_checkpoint_it_takes_over_again(whole, tmp_path)
     copy = shutil.copytree(whole, tmp_path / "copy")
     shutil.rmtree(copy / "checkpoints")
     (copy / "summary.json").unlink()
+    left = copy / ".run.12345.partial"  # by a kill while the agents' directory was made
+    shutil.copytree(copy / hybrid.FOLDER, left)
     assert train.main([f"resume={copy}"]) == 0
     assert_same_run(copy, whole)
+    assert not left.exists()
 
 
 def test_it_is_evaluated_like_any_run(whole, capsys):
