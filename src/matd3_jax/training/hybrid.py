@@ -83,7 +83,7 @@ def begin(
 ) -> TrainState:
     """Go on from the checkpoint `saved` of the agents' part: the same actions, the mean of their values, the same
     episodes and transitions, and the optimizers' moments; with `handover=distill` networks that have learned the
-    actions and values, of which `tell` is told."""
+    actions and values; `tell` gets a line on how well."""
     small = checkpoint.restore_actors(saved, agents.trainer, agents.share)
     fresh = training.trainer.init(training.keys())
     there, here = agents.layout, training.layout
