@@ -73,9 +73,16 @@ class Data:
         taken = False
         for label, settings in wanted.items():
             for name, fact in other.facts.items():
-                same = not differences(fact["settings"], settings.to_dict())
-                if same and not other.unfinished(name) and self.missing(label, settings):
-                    taken |= self.offer(label, other.rows[name], fact)
+                new = set(self.missing(label, settings)) & other.seeds(name)
+                if not new or other.unfinished(name) or differences(fact["settings"], settings.to_dict()):
+                    continue
+                rows = other.rows[name].take(np.isin(other.rows[name]["seed"], list(new)))
+                measured = {column: rows[column] for column in rows.columns if column not in other.keys}
+                values = key_values(self.keys, fact["settings"])
+                rows = Table({**{key: np.full(len(rows), value) for key, value in values.items()}, **measured})
+                if new < other.seeds(name):
+                    fact = joined([{**fact, "parts": _only(fact, new)}], new)
+                taken |= self.offer(label, rows, fact)
         return taken
 
     def has(self, label: str, wanted: Config) -> bool:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import evaluations, figures, study, verdict
+from experiments import ant, evaluations, figures, study, verdict
 from experiments.study import RESULTS, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
@@ -168,7 +168,7 @@ STUDY = study.of_evaluations(
     details=details,
     options=HybridOptions,
     folders=folders,
-    beside=lambda options: (options.robot,),
+    beside=lambda options: {options.robot: ant.STUDY.keys},
 )
 
 

@@ -1,6 +1,7 @@
 """What the runs of a study took, from their facts: for each machine env steps, hours and rates."""
 
-from collections.abc import Iterator, Mapping
+import json
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from experiments import collecting
@@ -11,8 +12,9 @@ def lines(facts: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """A Markdown table of the finished settings; runs that were trained side by side share their hours by seeds."""
     rows: dict[tuple[str, ...], list[tuple[int, float]]] = {}
     for fact in facts.values():
-        for machine, seeds, steps, seconds in _parts(fact):
-            rows.setdefault(_machine(machine), []).append((seeds * steps, seconds))
+        for part in _parts(fact):
+            steps = len(part["seeds"]) * part["summary"]["total_steps"]
+            rows.setdefault(_machine(part["machine"]), []).append((steps, _seconds(part)))
     if not rows:
         return []
     table = ["| machine | jax | env steps of all seeds | hours | env steps/s |", "|---" * 5 + "|"]
@@ -22,18 +24,29 @@ def lines(facts: Mapping[str, Mapping[str, Any]]) -> list[str]:
     return ["Hours of training, compiling and evaluations included:", "", *table, ""]
 
 
-def hours(facts: Mapping[str, Mapping[str, Any]]) -> float:
-    """Of all finished settings, on whatever machine."""
-    return sum(seconds for fact in facts.values() for *_, seconds in _parts(fact)) / 3600
+def hours(studies: Iterable[Mapping[str, Mapping[str, Any]]]) -> float:
+    """Of all finished settings of several studies' facts, on whatever machine; runs that they share count once."""
+    seconds: dict[str, float] = {}
+    for facts in studies:
+        for fact in facts.values():
+            settings = {key: value for key, value in fact["settings"].items() if key not in ("seed", "seeds")}
+            for part in _parts(fact):
+                run = json.dumps([settings, part["machine"], part["summary"]], sort_keys=True)
+                seconds[run] = max(seconds.get(run, 0.0), _seconds(part))
+    return sum(seconds.values()) / 3600
 
 
-def _parts(fact: Mapping[str, Any]) -> Iterator[tuple[Mapping[str, Any], int, int, float]]:
-    """(machine, seeds, env steps of each, seconds that count for them) of a setting's runs."""
-    for part in collecting.parts_of(fact) if fact["summary"] != UNFINISHED else ():
-        summary, seeds = part["summary"], len(part["seeds"])
-        if "seconds" in summary:
-            together = summary.get("side_by_side", seeds)
-            yield part["machine"], seeds, summary["total_steps"], summary["seconds"] * seeds / max(together, seeds)
+def _parts(fact: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """A finished setting's runs whose time is known."""
+    if fact["summary"] == UNFINISHED:
+        return []
+    return [part for part in collecting.parts_of(fact) if "seconds" in part["summary"]]
+
+
+def _seconds(part: Mapping[str, Any]) -> float:
+    """What counts for a run's seeds of those that were trained side by side."""
+    seeds = len(part["seeds"])
+    return part["summary"]["seconds"] * seeds / max(part["summary"].get("side_by_side", seeds), seeds)
 
 
 def _machine(facts: Mapping[str, Any]) -> tuple[str, str]:

@@ -87,7 +87,7 @@ def main(argv: Sequence[str]) -> int:
     ours = [entry for one in OURS.values() for entry in entries(one, options.results) if entry.folder]
     ours += strangers(options.results)
     where = options.page.parent
-    hours = sum(machine_time.hours(data.facts) for data in _all_data(options.results))
+    hours = machine_time.hours(data.facts for data in _all_data(options.results))
     blocks = {
         "claims": [counts(paper, hours), "", *table(paper, where)],
         "ours": table(ours, where) if ours else ["No data yet."],

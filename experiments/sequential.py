@@ -9,7 +9,7 @@ HARL's figures have its HATD3 at 5,900 and its MATD3 at 5,700 there, after ten m
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments import evaluations, study, verdict
+from experiments import evaluations, robots, study, verdict
 from experiments.one_at_a_time import QUANTITY, label
 from experiments.study import StudyOptions
 from experiments.tidy import Table
@@ -68,7 +68,7 @@ STUDY = study.of_evaluations(
     claims=claims,
     draw=draw,
     details=details,
-    beside=lambda options: ("robots",),
+    beside=lambda options: {"robots": robots.STUDY.keys},
 )
 
 

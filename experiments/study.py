@@ -79,7 +79,7 @@ class Study:
         folders: (options) -> name of the folders under runs/experiments and experiments/results; default: NAME,
             NAME_small.
         beside: (options) -> names of other studies' folders beside the results, whose rows of the same settings are
-            taken over.
+            taken over, each with the `keys` of its study.
         data, figure: names of those files.
     """
 
@@ -98,7 +98,7 @@ class Study:
     options: type[StudyOptions] = StudyOptions
     check: Callable[[Any], None] = lambda options: None
     folders: Callable[[Any], tuple[Path, Path]] | None = None
-    beside: Callable[[Any], Sequence[str]] = lambda options: ()
+    beside: Callable[[Any], Mapping[str, Mapping[str, str]]] = lambda options: {}
     data: str = "data.csv"
     figure: str = "figure.png"
 
@@ -175,7 +175,8 @@ class Plan:
         devices.prepare()
         wanted = _wanted(study, options)
         data = collecting.read(*_files(study, out), study.keys)
-        others = [collecting.read(*_files(study, out.parent / name), study.keys) for name in study.beside(options)]
+        there = study.beside(options).items()
+        others = [collecting.read(*_files(study, out.parent / name), keys) for name, keys in there]
         adopted = any([data.adopt(other, wanted) for other in others])
         missing: dict[str, tuple[str, Config]] = {}
         if options.train:

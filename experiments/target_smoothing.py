@@ -1,13 +1,14 @@
 """`python -m experiments.target_smoothing`: MATD3 with several levels of target policy smoothing on Cooperative
 Navigation.
 
-Figure 6 of the paper: return along training for several standard deviations of the noise on the target actions.
+Figure 6 of the paper: return along training for several standard deviations of the noise on the target actions. What
+`experiments.policy_delay` has trained with the same settings is taken over: its d = 2 is without smoothing.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments import figures, study, tidy, verdict
+from experiments import figures, policy_delay, study, tidy, verdict
 from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
@@ -83,6 +84,7 @@ STUDY = Study(
     claims=claims,
     draw=draw,
     details=lambda table: figures.finals_table(table, ("target_noise",), {"final return": "return_agents"}),
+    beside=lambda options: {"policy_delay": policy_delay.STUDY.keys},
 )
 
 

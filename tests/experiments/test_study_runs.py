@@ -19,10 +19,13 @@ from experiments import (
     cooperative,
     cooperative_navigation,
     grid_search,
+    machine_time,
+    policy_delay,
     study,
     target_smoothing,
     tidy,
 )
+from experiments.policy_delay import DelayOptions
 from experiments.study import StudyOptions
 from matd3_jax import config
 from matd3_jax.errors import UserError
@@ -180,6 +183,28 @@ def test_seeds_of_several_directories_are_one_setting(tmp_path):
     assert not data.offer("a", *collecting.gather({"algo": "algo.name"}, paths[:1], "command", **how))
     (paths[0] / "summary.json").unlink()
     assert not data.offer("a", *collecting.gather({"algo": "algo.name"}, paths, "command", **how))
+
+
+def test_what_another_study_has_trained_is_taken_over(tmp_path):
+    """Rows of the same settings and of wanted seeds alone, told apart by the columns of their own study, whose hours
+    count once."""
+    runs, out = tmp_path / "runs", tmp_path / "results" / "target_smoothing"
+    for k, (label, line) in enumerate(policy_delay.settings("paper", DelayOptions()).items()):
+        returns = {"return_agents": (NOISE, 10 * k + NOISE), "return_adversaries": (NOISE, NOISE)}
+        fake_run(runs / label, [t for t in line if "seeds" not in t], returns)
+    beside = tmp_path / "results" / "policy_delay"
+    assert policy_delay.main(["train=false", f"runs={runs}", f"out={beside}"]) == 0
+    assert target_smoothing.main(["train=false", "seeds=3", f"runs={tmp_path / 'none'}", f"out={out}"]) == 0
+    there = collecting.read(beside / "data.csv", beside / "runs.json", policy_delay.STUDY.keys)
+    data = collecting.read(out / "data.csv", out / "runs.json", target_smoothing.STUDY.keys)
+    assert list(data.facts) == ["sigma0"] and data.seeds("sigma0") == {0, 1, 2} and "policy_delay" not in data.table
+    wanted = there.rows["simple_spread-d2"].by_seed("return_agents")[:3]
+    np.testing.assert_array_equal(data.table.where(target_noise=0).by_seed("return_agents"), wanted)
+    assert not np.isin(wanted, there.rows["simple_spread-d1"]["return_agents"]).all()
+    (part,) = data.facts["sigma0"]["parts"]
+    assert part["seeds"] == [0, 1, 2] and "experiments.policy_delay" in part["command"]
+    hours = [machine_time.hours(facts) for facts in ([there.facts], [there.facts, data.facts], [data.facts])]
+    assert hours[0] == hours[1] > hours[2] > 0
 
 
 def test_all_makes_one_summary(tmp_path, monkeypatch):
