@@ -147,11 +147,13 @@ def test_what_is_no_damage(run, capsys):
     and before its first checkpoint."""
     unfinished(run)
     (run / ".config.7.partial.yaml").write_text("")
+    (run / ".run.7.partial").mkdir()  # of the agents' part of a hybrid run
     (run / "checkpoints" / ".900.partial").mkdir()
     first, *_ = checkpoint.steps(run / "checkpoints")
     (run / "checkpoints" / f"{first}").rename(run / "checkpoints" / f"{first}{checkpoint.ASIDE}")
     code, said = checked(run, capsys)
-    assert code == 0 and "cut short, removed by the next resume: .config.7.partial.yaml, .900.partial" in said
+    left = ".config.7.partial.yaml, .run.7.partial, .900.partial"
+    assert code == 0 and f"cut short, removed by the next resume: {left}" in said
     assert f"set aside, until the next checkpoint: {first}{checkpoint.ASIDE}" in said
     assert way_on(said) == [f"resume={run}"]
     shutil.rmtree(run / "checkpoints")

@@ -52,14 +52,19 @@ def test_every_command_refuses_a_newer_format_in_one_line(run, name, key, tmp_pa
     assert {path: path.read_bytes() for path in run.path.iterdir()} == before
 
 
-def test_what_killed_writes_left_is_removed_and_nothing_else(run):
+def test_what_killed_writes_left_is_removed_and_nothing_else(run, tmp_path):
     left = [".config.123.partial.yaml", ".learning_curve.9.partial.png", ".lock.1.partial"]
     kept = [".config.partial.yaml", ".hidden", "a.1.partial", ".config.x.partial.yaml"]
-    for name in left + kept:
-        (run.path / name).write_text("")
-    assert [path.name for path in files.partial(run.path)] == sorted(left)
+    elsewhere = tmp_path / "elsewhere"
+    for folder, names in ((run.path, left + kept), (run.path / ".run.12.partial", ["a"]), (elsewhere, ["a"])):
+        folder.mkdir(exist_ok=True)
+        for name in names:
+            (folder / name).write_text("")
+    (run.path / ".run.13.partial").symlink_to(elsewhere)
+    assert [path.name for path in files.partial(run.path)] == sorted([*left, ".run.12.partial", ".run.13.partial"])
     run.clean()
     assert {path.name for path in run.path.iterdir()} == {*kept, "config.yaml", "machine.json"}
+    assert (elsewhere / "a").exists()
 
 
 @pytest.mark.parametrize("name", ["metrics.csv", "checkpoints", "tensorboard", "videos", "wandb"])

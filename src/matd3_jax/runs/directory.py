@@ -162,7 +162,7 @@ class RunDirectory:
         return self.metrics, self.checkpoints, self.tensorboard, self.videos, self.wandb
 
     def clean(self) -> None:
-        """Take away the partial files and directories that killed writes left, while the directory's lock is held.
+        """Take away what killed writes left, while the directory's lock is held.
 
         Raises UserError where what is written in place is a link: what is behind it is not the run's.
         """
@@ -170,9 +170,6 @@ class RunDirectory:
             if path.is_symlink():
                 raise UserError(f"{path} is a link: nothing is written through it")
         files.remove_partial(self.path)
-        for path in self.path.glob(".run.*.partial"):  # of the agents' part of a hybrid run
-            if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path)
 
     def append(self, row: Mapping[str, np.ndarray]) -> None:
         """Add one row for each seed to the metrics table. row: columns [seeds], the same ones every time."""

@@ -8,6 +8,7 @@ import json
 import math
 import os
 import re
+import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from typing import Any
 from matd3_jax.errors import UserError
 
 PARTIAL = re.compile(r"\..+\.\d+\.partial(\.\w+)?")
-"""Names of the files that `replacing` writes, until they replace the old ones."""
+"""Names of the files that `replacing` writes, and of new directories of runs, until they get their own."""
 
 
 @contextlib.contextmanager
@@ -37,14 +38,17 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def partial(folder: Path) -> list[Path]:
-    """Files in a folder that `replacing` began and a kill left."""
-    return sorted(path for path in folder.glob(".*.partial*") if PARTIAL.fullmatch(path.name) and not path.is_dir())
+    """Files and directories in a folder that were begun under a name of `PARTIAL` and left by a kill."""
+    return sorted(path for path in folder.glob(".*.partial*") if PARTIAL.fullmatch(path.name))
 
 
 def remove_partial(folder: Path) -> None:
     """Delete what `partial` finds; nobody else may write there now."""
     for path in partial(folder):
-        path.unlink(missing_ok=True)
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
