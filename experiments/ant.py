@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import evaluations, figures, study, verdict
+from experiments import evaluations, figures, markdown, study, verdict
 from experiments.study import RESULTS, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
@@ -105,7 +105,7 @@ def draw(table: Table, path: Path) -> None:
 def details(table: Table) -> list[str]:
     algos = dict.fromkeys(table["algo"].tolist())
     rows = [[figures.NAMES[algo], *evaluations.row(table.where(algo=algo))] for algo in algos]
-    return evaluations.table(("algorithm", *evaluations.HEAD), rows)
+    return markdown.table(("algorithm", *evaluations.HEAD), rows)
 
 
 STUDY = study.of_evaluations(

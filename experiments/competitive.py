@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import figures, study, tidy, verdict
+from experiments import figures, markdown, study, tidy, verdict
 from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
@@ -102,18 +102,16 @@ def draw(table: Table, path: Path) -> None:
 
 
 def details(table: Table) -> list[str]:
-    lines = [
-        "| task | team | against | seeds | env steps | team's final return (95 % interval) | normalized |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    head = ("task", "team", "against", "seeds", "env steps", "team's final return (95 % interval)", "normalized")
+    rows = []
     for env in ENVS:
         values = normalized(table, env) if env in table.values("env") else {}
         for (team, single), scaled in values.items():
             found = team_return(table, env, team, single)
             steps = pairing(table, env, team, single).by_seed("step")[0, -1]
             cells = [figures.task(env), figures.NAMES[team], figures.NAMES[single], str(len(scaled)), f"{steps:,.0f}"]
-            lines.append(f"| {' | '.join([*cells, figures.interval(found), f'{scaled.mean():.2f}'])} |")
-    return lines
+            rows.append([*cells, figures.interval(found), f"{scaled.mean():.2f}"])
+    return markdown.table(head, rows)
 
 
 STUDY = Study(

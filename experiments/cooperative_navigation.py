@@ -17,6 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import matd3_jax
+from experiments import markdown
 from matd3_jax.cli import command
 from matd3_jax.cli.options import Command, option, others
 from matd3_jax.figures import style
@@ -84,10 +85,8 @@ def report(out: Path) -> None:
     theirs = {algo: blocks(*_authors(algo)) for algo in ALGORITHMS}
     figure = Figure(figsize=(9.5, 3.8), layout="constrained")
     FigureCanvasAgg(figure)
-    lines = [
-        "| algorithm | episodes | this project: mean (sd, seeds) | authors: mean (sd, seeds) | difference (95 %) |"
-    ]
-    lines.append("|---|---|---|---|---|")
+    whose = (f"{name}: mean (sd, seeds)" for name in ("this project", "authors"))
+    head, rows = ("algorithm", "episodes", *whose, "difference (95 %)"), []
     for axis, algo in zip(figure.subplots(1, 2, sharey=True), ALGORITHMS, strict=True):
         episodes, mine = ours[algo]
         axis.plot(theirs[algo][0], theirs[algo][1].T, color="black", linewidth=0.9, alpha=0.6)
@@ -107,9 +106,10 @@ def report(out: Path) -> None:
             cells += [f"{v.mean():.1f} ({v.std(ddof=1):.1f}, {len(v)})" for v in (a, other)]
             test = compare(a, other)
             cells.append(plus_minus(float(test.difference), float(test.high - test.low) / 2, "+.1f", ".1f"))
-            lines.append(f"| {' | '.join(cells)} |")
+            rows.append(cells)
     figure.axes[0].set_ylabel("training return, summed over agents")
     style.save(figure, out / "curves.png", dpi=130)
+    lines = markdown.table(head, rows)
     files.write_text(out / "table.md", "\n".join(lines) + "\n")
     say("\n".join(lines))
 

@@ -8,7 +8,7 @@ evaluations in the last third.
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments import evaluations, figures, study
+from experiments import evaluations, figures, markdown, study
 from experiments.one_at_a_time import against_base, better, label
 from experiments.study import StudyOptions
 from experiments.tidy import Table
@@ -81,7 +81,7 @@ def details(table: Table) -> list[str]:
             found = part(table, env, name)
             if len(found):
                 rows.append([env, name, figures.interval(evaluations.late(found)), *evaluations.row(found)])
-    return evaluations.table(("robot", "critics", "mean in the last third", *evaluations.HEAD), rows)
+    return markdown.table(("robot", "critics", "mean in the last third", *evaluations.HEAD), rows)
 
 
 STUDY = study.of_evaluations(

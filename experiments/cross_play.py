@@ -17,7 +17,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from experiments import figures, verdict
+from experiments import figures, markdown, verdict
 from experiments.competitive import ALGOS, ENVS, PAIRINGS, team_is_adversaries
 from experiments.cross_play_data import Task, of_command, read, write
 from experiments.study import RESULTS
@@ -222,12 +222,14 @@ def report(tasks: Mapping[str, Task], out: Path) -> None:
         sizes.setdefault(f"{size} of each pair.", []).append(figures.task(env))
     lines += [line for size, names in sizes.items() for line in (f"{', '.join(names)}: {size}", "")]
     lines += [*verdict.lines(claims(tasks)), "", verdict.DEFINITIONS, ""]
-    lines += ["| task | team | single agent | own partner | strangers | pairs of strangers |", "|---" * 6 + "|"]
+    rows = []
     for env, task in tasks.items():
         for pair in PAIRINGS:
             own, others = (task.mean([pair], own) for own in (True, False))
             cells = [figures.task(env), *(figures.NAMES[algo] for algo in pair), _number(own), _number(others)]
-            lines.append(f"| {' | '.join(cells)} | {0 if others is None else others.pairs:,} |")
+            rows.append([*cells, f"{0 if others is None else others.pairs:,}"])
+    head = ("task", "team", "single agent", "own partner", "strangers", "pairs of strangers")
+    lines += markdown.table(head, rows)
     lines += ["", "![Team's returns with own partners and with strangers](cross_play.png)"]
     files.write_text(out / "cross_play.md", "\n".join(lines) + "\n")
     say("\n".join(lines[:-2]))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import evaluations, figures, study, verdict
+from experiments import evaluations, figures, markdown, study, verdict
 from experiments.one_at_a_time import QUANTITY, against_base, better, label
 from experiments.overestimation import measured
 from experiments.study import StudyOptions
@@ -151,7 +151,7 @@ def details(table: Table) -> list[str]:
             rows.append(cells)
     head = ("task", "target of", "seeds", "env steps", "relative bias, %", QUANTITY, "last return")
     return [
-        *evaluations.table(head, rows),
+        *markdown.table(head, rows),
         "",
         "In brackets: 95 % intervals of the mean. Bias: in the last third of training.",
     ]

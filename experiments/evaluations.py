@@ -1,13 +1,13 @@
 """Deterministic evaluations along training: curves, bands and rows of tables, for the studies of robots."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter
 
-from experiments import figures, verdict
+from experiments import figures, markdown
 from experiments.tidy import Table
 from matd3_jax.figures import style
 from matd3_jax.stats.intervals import Estimate, t_interval
@@ -67,11 +67,6 @@ def row(part: Table) -> list[str]:
     ]
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table."""
-    return [verdict.row(cells) for cells in (head, ["---"] * len(head), *rows)]
-
-
 # ---- of several settings by name, in one task ------------------------------------------------------------------------
 
 
@@ -90,4 +85,4 @@ def details_of_each(what: str, quantity: str, parts: Mapping[str, Table]) -> lis
     """The table of all settings that have been run: `quantity`, and the last returns."""
     found = {name: part for name, part in parts.items() if late(part) is not None}
     rows = [[name, figures.interval(late(part)), *row(part)[:-1]] for name, part in found.items()]
-    return table((what, quantity, *HEAD[:-1]), rows)
+    return markdown.table((what, quantity, *HEAD[:-1]), rows)

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from experiments import tidy
+from experiments import markdown, tidy
 from experiments.tidy import Table
 from matd3_jax.figures import style
 from matd3_jax.figures.style import web
@@ -112,7 +112,7 @@ def finals_table(table: Table, keys: Sequence[str], columns: Mapping[str, str]) 
     columns: headings, and the columns that they stand for; one that a setting lacks is left open.
     """
     head = (*keys, "seeds", "env steps", *(f"{heading} (95 % interval)" for heading in columns), "sd over seeds")
-    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    rows = []
     for values in dict.fromkeys(zip(*(table[key].tolist() for key in keys), strict=True)):
         part = table.where(**dict(zip(keys, values, strict=True)))
         cells = [NAMES.get(value, value) if isinstance(value, str) else f"{value:g}" for value in values]
@@ -120,8 +120,8 @@ def finals_table(table: Table, keys: Sequence[str], columns: Mapping[str, str]) 
         finals = [tidy.final(part, name) for name in columns.values()]
         cells += [interval(final) for final in finals]
         spreads = [NOTHING if f is None or len(f) < 2 or np.isnan(f).any() else f"{f.std(ddof=1):.3g}" for f in finals]
-        lines.append(f"| {' | '.join([*cells, ', '.join(spreads)])} |")
-    return lines
+        rows.append([*cells, ", ".join(spreads)])
+    return markdown.table(head, rows)
 
 
 def interval(values: np.ndarray | None) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import figures, study, tidy, verdict
+from experiments import figures, markdown, study, tidy, verdict
 from experiments.study import RESULTS, Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
@@ -138,11 +138,11 @@ def draw(table: Table, path: Path) -> None:
 def details(table: Table) -> list[str]:
     wanted = best(table)
     head = ("rank", *wanted, "seeds", "final return (95 % interval)", "mean return over the whole training")
-    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    rows = []
     for k, (point, final, along) in enumerate(ranking(table)):
         cells = [str(k + 1), *(f"{point[key]:g}" for key in wanted), str(len(final)), figures.interval(final)]
-        lines.append(f"| {' | '.join([*cells, figures.interval(along)])} |")
-    return lines
+        rows.append([*cells, figures.interval(along)])
+    return markdown.table(head, rows)
 
 
 STUDY = Study(

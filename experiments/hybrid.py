@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import ant, evaluations, figures, study, verdict
+from experiments import ant, evaluations, figures, markdown, study, verdict
 from experiments.study import RESULTS, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
@@ -152,7 +152,7 @@ def draw(table: Table, path: Path) -> None:
 
 def details(table: Table) -> list[str]:
     rows = [[name, *evaluations.row(part)] for name, part in parts(table).items() if len(part)]
-    return evaluations.table(("algorithm", *evaluations.HEAD), rows)
+    return markdown.table(("algorithm", *evaluations.HEAD), rows)
 
 
 STUDY = study.of_evaluations(

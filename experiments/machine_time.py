@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from experiments import collecting
+from experiments import collecting, markdown
 from experiments.collecting import UNFINISHED
 
 
@@ -17,11 +17,12 @@ def lines(facts: Mapping[str, Mapping[str, Any]]) -> list[str]:
             rows.setdefault(_machine(part["machine"]), []).append((steps, _seconds(part)))
     if not rows:
         return []
-    table = ["| machine | jax | env steps of all seeds | hours | env steps/s |", "|---" * 5 + "|"]
+    cells = []
     for machine, parts in rows.items():
         steps, seconds = sum(part[0] for part in parts), sum(part[1] for part in parts)
-        table.append(f"| {' | '.join(machine)} | {steps:,} | {seconds / 3600:.2f} | {steps / seconds:,.0f} |")
-    return ["Hours of training, compiling and evaluations included:", "", *table, ""]
+        cells.append([*machine, f"{steps:,}", f"{seconds / 3600:.2f}", f"{steps / seconds:,.0f}"])
+    head = ("machine", "jax", "env steps of all seeds", "hours", "env steps/s")
+    return ["Hours of training, compiling and evaluations included:", "", *markdown.table(head, cells), ""]
 
 
 def hours(studies: Iterable[Mapping[str, Mapping[str, Any]]]) -> float:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import figures, study, tidy, verdict
+from experiments import figures, markdown, study, tidy, verdict
 from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim, Difference
@@ -213,12 +213,10 @@ def report(out: Path) -> None:
         "",
     ]
     for t, team in enumerate(TEAMS):
-        lines += [f"| return of {team}: agents of | " + " | ".join(f"against {name}" for name in names) + " |"]
-        lines += ["|---" * (len(names) + 1) + "|"]
-        for i, name in enumerate(names):
-            cells = [_cell(pairings.cell(i, j, own=False), t) for j in range(len(names))]
-            lines.append(f"| {name} | {' | '.join(cells)} |")
-        lines.append("")
+        head = (f"return of {team}: agents of", *(f"against {name}" for name in names))
+        columns = range(len(names))
+        rows = [[name, *(_cell(pairings.cell(i, j, own=False), t) for j in columns)] for i, name in enumerate(names)]
+        lines += [*markdown.table(head, rows), ""]
     heat_map.draw(out / "cross_play.png", names, pairings, "Physical Deception, seeds x seeds")
     lines += ["![Returns between strangers](cross_play.png)"]
     files.write_text(out / "cross_play.md", "\n".join(lines) + "\n")

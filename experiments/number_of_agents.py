@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from experiments import figures, study, verdict
+from experiments import figures, markdown, study, verdict
 from experiments.overestimation import measured
 from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
@@ -87,13 +87,12 @@ def draw(table: Table, path: Path) -> None:
 
 def details(table: Table) -> list[str]:
     head = ("algorithm", "agents", "seeds", "env steps", "relative overestimation (95 % interval)")
-    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    rows = []
     for algo in ALGOS:
         for number, values in relative(table, algo).items():
             steps = table.where(algo=algo, num_agents=number).by_seed("step")[0, -1]
-            cells = [figures.NAMES[algo], str(number), str(len(values)), f"{steps:,.0f}", figures.interval(values)]
-            lines.append(f"| {' | '.join(cells)} |")
-    return lines
+            rows.append([figures.NAMES[algo], str(number), str(len(values)), f"{steps:,.0f}", figures.interval(values)])
+    return markdown.table(head, rows)
 
 
 STUDY = Study(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import evaluations, figures, study, verdict
+from experiments import evaluations, figures, markdown, study, verdict
 from experiments.study import StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
@@ -71,7 +71,7 @@ class OneAtATime:
             [name, figures.interval(evaluations.late(part)), *evaluations.row(part)]
             for name, part in self.parts(table).items()
         ]
-        return evaluations.table(("changed", QUANTITY.replace("evaluation ", ""), *evaluations.HEAD), rows)
+        return markdown.table(("changed", QUANTITY.replace("evaluation ", ""), *evaluations.HEAD), rows)
 
 
 def against_base(

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import figures, study, tidy, verdict
+from experiments import figures, markdown, study, tidy, verdict
 from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
@@ -202,10 +202,8 @@ def draw(table: Table, path: Path) -> None:
 
 
 def details(table: Table) -> list[str]:
-    lines = [
-        "| algorithm | seeds | env steps | estimate | true value | overestimation: mean over training | final return |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    head = ("algorithm", "seeds", "env steps", "estimate", "true value", "overestimation: mean over training")
+    rows = []
     for algo in ALGOS:
         part = table.where(algo=algo)
         found = measured(part)
@@ -213,10 +211,9 @@ def details(table: Table) -> list[str]:
             continue
         steps, estimate, truth = found
         values = [last(estimate), last(truth), (estimate - truth).mean(axis=1), _final(part)]
-        cells = [figures.NAMES[algo], str(len(estimate)), f"{steps[-1]:,.0f}", *map(figures.interval, values)]
-        lines.append(f"| {' | '.join(cells)} |")
+        rows.append([figures.NAMES[algo], str(len(estimate)), f"{steps[-1]:,.0f}", *map(figures.interval, values)])
     return [
-        *lines,
+        *markdown.table((*head, "final return"), rows),
         "",
         "Estimates and true values: means over the last fifth of training. In brackets: 95 % intervals. Lag: what is "
         "left, after k moves of the targets, of the critics' start at zero where values are negative, -V (1 - tau (1 - "

@@ -18,6 +18,7 @@ from experiments import (
     cross_play,
     cross_play_data,
     machine_time,
+    markdown,
     robots,
     target_speed,
     verdict,
@@ -192,7 +193,7 @@ def counts(found: Sequence[Entry], hours: float) -> str:
 def table(found: Sequence[Entry], where: Path) -> list[str]:
     """A Markdown table for a page in the folder `where`."""
     head = ("the claim", "measured", "size", "found: difference (95 % interval)", "verdict", "")
-    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    rows = []
     for entry in found:
         claim, links, words = entry.claim, NOTHING, NOTHING
         if claim.difference is not None and entry.folder is not None:
@@ -201,9 +202,8 @@ def table(found: Sequence[Entry], where: Path) -> list[str]:
             links = (
                 f"[table]({_link(entry.folder / file, where)}), [figure]({_link(entry.folder / entry.figure, where)})"
             )
-        cells = (claim.paper, claim.quantity, entry.size, words, f"**{claim.verdict}**", links)
-        lines.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
-    return lines
+        rows.append((claim.paper, claim.quantity, entry.size, words, f"**{claim.verdict}**", links))
+    return markdown.table(head, rows)
 
 
 def _link(path: Path, where: Path) -> str:

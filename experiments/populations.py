@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.ticker import EngFormatter
 
-from experiments import estimating, figures, verdict
+from experiments import estimating, figures, markdown, verdict
 from experiments.estimating import Batch, Estimator
 from experiments.populations_data import METRIC, RANDOM, Data, best, compared, label, median_interval, ratios
 from experiments.study import RESULTS
@@ -117,6 +117,7 @@ def main(argv: Sequence[str]) -> int:
             return code
         data.take(key, line, folder / label(*key))
         data.write(out)
+    data = Data.read(out)  # the report is made of what is written
     if not data.values:
         raise UserError("there is nothing to report")
     report(data, out)
@@ -204,7 +205,7 @@ def claims(data: Data) -> list[Claim]:
 
 def details(data: Data) -> list[str]:
     head = ("task", "method", "members", "populations", "env steps", "best at the end, median", "ratio of env steps")
-    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    rows = []
     there = compared(data)
     for key, values in data.values.items():
         populations, members, _ = values.shape
@@ -214,8 +215,8 @@ def details(data: Data) -> list[str]:
         if key in there:
             middle, low, high = median_interval(ratios(data, *key))
             text = number(middle) + ("" if np.isnan(low) else f" ({number(low)} to {number(high)})")
-        lines.append(f"| {' | '.join([*cells, text])} |")
-    return lines
+        rows.append([*cells, text])
+    return markdown.table(head, rows)
 
 
 def report(data: Data, out: Path) -> None:

@@ -7,7 +7,7 @@ MATD3 and MADDPG (Zhong et al. 2024), read off its figures.
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments import evaluations, figures, study, verdict
+from experiments import evaluations, figures, markdown, study, verdict
 from experiments.one_at_a_time import QUANTITY
 from experiments.study import StudyOptions
 from experiments.tidy import Table
@@ -96,7 +96,7 @@ def details(table: Table) -> list[str]:
             if len(part):
                 who = [env, split, figures.NAMES[algo]]
                 rows.append([*who, *evaluations.row(part), harl.get(algo, NOTHING)])
-    return evaluations.table(("robot", "split", "algorithm", *evaluations.HEAD, "HARL's"), rows)
+    return markdown.table(("robot", "split", "algorithm", *evaluations.HEAD, "HARL's"), rows)
 
 
 STUDY = study.of_evaluations(

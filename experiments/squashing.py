@@ -8,7 +8,7 @@ twice the learning rate is a tanh.
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments import evaluations, figures, study, verdict
+from experiments import evaluations, figures, markdown, study, verdict
 from experiments.study import StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
@@ -85,7 +85,7 @@ def details(table: Table) -> list[str]:
         part = table.where(actor_output=key[0], actor_lr=key[1])
         if len(part):
             rows.append([name(*key), figures.interval(evaluations.late(part)), *evaluations.row(part)])
-    return evaluations.table(("squashing, learning rate", "mean in the last third", *evaluations.HEAD), rows)
+    return markdown.table(("squashing, learning rate", "mean in the last third", *evaluations.HEAD), rows)
 
 
 STUDY = study.of_evaluations(

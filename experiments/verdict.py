@@ -21,6 +21,7 @@ from typing import Literal
 import numpy as np
 from scipy import stats
 
+from experiments import markdown
 from matd3_jax.stats import intervals
 from matd3_jax.stats.text import NOTHING, ends, number
 
@@ -169,7 +170,7 @@ def compare(
 def lines(claims: Sequence[Claim]) -> list[str]:
     """A Markdown table of the claims."""
     head = ("the paper", "measured", "what we found", "difference (95 % interval)", "p", "p (Holm)", "verdict")
-    table = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    rows = []
     directed = {i: c.difference.p for i, c in enumerate(claims) if c.difference is not None and c.kind == "greater"}
     corrected = dict(zip(directed, holm(list(directed.values())), strict=True))
     for i, claim in enumerate(claims):
@@ -177,13 +178,8 @@ def lines(claims: Sequence[Claim]) -> list[str]:
         if claim.difference is not None:
             cells[3], cells[4] = in_words(claim), _p(claim.difference.p)
             cells[5] = _p(corrected[i]) if i in corrected else NOTHING
-        table.append(row(cells))
-    return table
-
-
-def row(cells: Sequence[str]) -> str:
-    """A row of a Markdown table."""
-    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+        rows.append(cells)
+    return markdown.table(head, rows)
 
 
 def in_words(claim: Claim) -> str:

@@ -133,7 +133,8 @@ def test_bad_input_gets_one_line(arguments, words, tmp_path):
 
 @pytest.mark.slow
 def test_a_call_that_was_stopped_is_resumed(tmp_path, monkeypatch, capsys):
-    """After the first of two sweeps; what is finished is not trained again, and other settings are refused."""
+    """After the first of two sweeps; what is finished is not trained again, other settings are refused, and the
+    report is that of the data that are kept."""
     given = [*TINY, f"runs={tmp_path / 'runs'}", f"out={tmp_path / 'out'}"]
     train, calls = sweep.main, []
 
@@ -141,6 +142,12 @@ def test_a_call_that_was_stopped_is_resumed(tmp_path, monkeypatch, capsys):
         calls.append(argv)
         return train(argv) if len(calls) != 2 else train([*argv, "train=false"]) or 143
 
+    def reporting(data, out):
+        reported.append(data)
+        report(data, out)
+
+    report, reported = populations.report, []
+    monkeypatch.setattr(populations, "report", reporting)
     monkeypatch.setattr(sweep, "main", stopping)
     assert populations.main(given) == 143 and not (tmp_path / "out" / "table.md").exists()
     facts = tmp_path / "runs" / "simple_spread-pbt" / "sweep.json"
@@ -153,4 +160,6 @@ def test_a_call_that_was_stopped_is_resumed(tmp_path, monkeypatch, capsys):
     assert populations.main(given) == 0 and len(calls) == 1
     data = Data.read(tmp_path / "out")
     assert {values.shape[:2] for values in data.values.values()} == {(1, 2)}
+    for key, values in data.values.items():
+        np.testing.assert_array_equal(reported[0].values[key], values)
     assert "| simple_spread | PBT | 2 | 1 |" in (tmp_path / "out" / "table.md").read_text()
