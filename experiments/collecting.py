@@ -100,14 +100,18 @@ class Data:
 
 
 def read(table: Path, facts: Path, keys: Mapping[str, str]) -> Data:
-    """What `write` left; nothing if there are no such files. Raises UserError if they do not belong together."""
+    """What `write` left; nothing if there are no such files. Raises UserError if they cannot be read, or do not belong
+    together."""
     data = Data(keys, {}, {})
     if not (table.exists() and facts.exists()):
         return data
-    rows = tidy.read(table)
-    for label, fact in json.loads(facts.read_text(encoding="utf-8")).items():
-        data.facts[label] = fact
-        values = key_values(keys, fact["settings"])
+    try:
+        rows, kept = tidy.read(table), json.loads(facts.read_text(encoding="utf-8"))
+        of_label = {label: key_values(keys, fact["settings"]) for label, fact in kept.items()}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise UserError(f"cannot read {table} with {facts}: {error}; mend or remove both") from error
+    for label, values in of_label.items():
+        data.facts[label] = kept[label]
         part = rows.where(**{key: value for key, value in values.items() if key in rows})
         if not len(part):
             raise UserError(f"{facts} speaks of {label}, of which {table} has no rows: remove both")
@@ -186,12 +190,11 @@ def gather(keys: Mapping[str, str], paths: Sequence[Path], command: str, **how: 
         own = {int(seed) for seed in table.values("seed")}
         seeds |= own
         rows.append(table)
-        summary = path / "summary.json"
         fact = {
             "command": command,
             "settings": {k: v for k, v in settings.to_dict().items() if k not in ("out", "name")},
-            "machine": json.loads((path / "machine.json").read_text(encoding="utf-8")),
-            "summary": json.loads(summary.read_text(encoding="utf-8")) if summary.exists() else UNFINISHED,
+            "machine": run.machine(),
+            "summary": run.summary() or UNFINISHED,
         }
         facts.append(fact)
         owned.append(own)

@@ -10,7 +10,6 @@ finished is used as it is, so a call that was stopped resumes with the same comm
 
 import dataclasses
 import fnmatch
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -170,8 +169,7 @@ def train(place: Path, line: Sequence[str]) -> int:
     where = [f"name={place.name}", f"out={place.parent}"]
     if not (place / "sweep.json").is_file():
         return sweep.main([*line, *where])
-    there = json.loads((place / "sweep.json").read_text())["command"]
-    if there != command.line("matd3_jax.sweep", *line, *where):
+    if sweep.open_sweep(place)[1].get("command") != command.line("matd3_jax.sweep", *line, *where):
         raise UserError(f"{place} was begun with other settings: choose another runs=, or remove it")
     return sweep.main([f"resume={place}"])
 

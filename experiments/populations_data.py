@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.stats
 
+from matd3_jax.cli.sweep import open_sweep
 from matd3_jax.errors import UserError
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runs.metrics import by_seed
@@ -50,7 +51,7 @@ class Data:
     def take(self, key: Key, line: list[str], place: Path) -> None:
         """Read the run directories of the sweep in `place`, which these arguments trained."""
         members = []
-        for name in json.loads((place / "sweep.json").read_text())["settings"]:
+        for name in open_sweep(place)[1]["settings"]:
             table = RunDirectory(place / "runs" / name).read_metrics()
             there = np.isfinite(table["eval_episode_length"])
             steps, values = by_seed({column: values[there] for column, values in table.items()}, METRIC)

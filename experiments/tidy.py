@@ -156,11 +156,15 @@ def write(table: Table, path: Path) -> None:
 
 
 def read(path: Path) -> Table:
-    """What `write` left; an empty table if there is no such file."""
+    """What `write` left; an empty table if there is no such file. Raises ValueError where a row has too few or too many
+    cells."""
     if not path.exists():
         return Table({})
     with path.open(newline="", encoding="utf-8") as file:
         header, *rows = csv.reader(file)
+    for k, row in enumerate(rows):
+        if len(row) != len(header):
+            raise ValueError(f"line {k + 2} of {path.name} has {len(row)} cells, not {len(header)}")
     return Table({name: _typed([row[i] for row in rows]) for i, name in enumerate(header)})
 
 

@@ -207,6 +207,28 @@ def test_what_another_study_has_trained_is_taken_over(tmp_path):
     assert hours[0] == hours[1] > hours[2] > 0
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("runs.json", '{"simple_spread-matd3"', "Expecting ':' delimiter"),
+        ("runs.json", "[1]", "no attribute 'items'"),
+        ("runs.json", '{"simple_spread-matd3": {}}', "settings"),
+        ("data.csv", "env,algo\n<<<<<<< HEAD\nsimple_spread,matd3\n", "line 2 of data.csv has 1 cells, not 2"),
+        ("data.csv", "", "not enough values"),
+        ("data.csv", "env,algo,seed\nsimple_spread,td3,0\n", "has no rows: remove both"),
+    ],
+)
+def test_data_that_cannot_be_read_are_named_in_one_line(tmp_path, name, text, words):
+    line = cooperative.settings("paper", StudyOptions())["simple_spread-matd3"]
+    places = [f"runs={tmp_path / 'runs'}", f"out={tmp_path / 'out'}"]
+    fake_run(tmp_path / "runs" / "simple_spread-matd3", line[:2], {"return_agents": (NOISE, NOISE)})
+    assert cooperative.main(["train=false", *places]) == 0
+    (tmp_path / "out" / name).write_text(text)
+    with pytest.raises(UserError, match=words) as found:
+        cooperative.main(["train=false", *places])
+    assert "remove both" in str(found.value) and "\n" not in str(found.value)
+
+
 def test_all_makes_one_summary(tmp_path, monkeypatch):
     monkeypatch.setattr(everything, "STUDIES", {s.STUDY.name: s.STUDY for s in (cooperative, target_smoothing, ant)})
     for label, line in target_smoothing.settings("paper", StudyOptions()).items():

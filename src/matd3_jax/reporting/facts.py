@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -132,12 +131,8 @@ def differences(settings: Sequence[Setting], column: str) -> list[Difference]:
 
 def _run(path: Path) -> Run:
     run, settings = RunDirectory.open(path)
-    try:
-        machine = json.loads((path / "machine.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        machine = {}
     last = int(run.read_metrics()["step"].max(initial=0))
-    return Run(run, settings, run.summary(), machine if isinstance(machine, dict) else {}, last)
+    return Run(run, settings, run.summary(), run.machine(), last)
 
 
 def _said(run: Run) -> dict[int, Divergence]:

@@ -127,11 +127,7 @@ class RunDirectory:
     @property
     def format(self) -> int:
         """Of what the directory holds: 0 where machine.json does not say."""
-        try:
-            found = json.loads((self.path / "machine.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError):
-            return 0
-        number = found.get("format", 0) if isinstance(found, dict) else 0
+        number = self.machine().get("format", 0)
         return number if isinstance(number, int) else 0
 
     @property
@@ -237,16 +233,25 @@ class RunDirectory:
             raise UserError(f"no row of {self.metrics} can be read: it is damaged")
         return columns
 
+    def machine(self) -> dict[str, Any]:
+        """What machine.json says of devices and versions; nothing where it cannot be read."""
+        return self._facts("machine.json")
+
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         files.write_json(self.path / "summary.json", summary)
 
     def summary(self) -> dict[str, Any] | None:
         """What a finished run left; None where there is none, or none that is whole."""
+        found = self._facts("summary.json")
+        return found if "total_steps" in found else None
+
+    def _facts(self, name: str) -> dict[str, Any]:
+        """What a JSON file says; nothing where it is not there or damaged."""
         try:
-            found = json.loads((self.path / "summary.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return None
-        return found if isinstance(found, dict) and "total_steps" in found else None
+            found = json.loads((self.path / name).read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError):
+            return {}
+        return found if isinstance(found, dict) else {}
 
 
 def _there(path: Path) -> str:
