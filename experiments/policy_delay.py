@@ -3,7 +3,7 @@ update.
 
 Figure 5 of the paper: Cooperative Navigation, and Covert Communication, where team and adversary have the same delay.
 A delay slows the targets, too, and with them the critics (`experiments.overestimation`): quick_targets=true gives them
-the same speed whatever the delay, and leaves slower policies alone.
+the same speed whatever the delay, and leaves slower policies alone; d = 1 is the same run and taken over.
 """
 
 import dataclasses
@@ -22,6 +22,7 @@ from matd3_jax.figures.style import SERIES
 
 ENVS = ("simple_spread", "simple_crypto")
 DELAYS = (1, 2, 3)
+KEYS = {"env": "env.name", "policy_delay": "algo.policy_delay"}
 
 SCALES = {
     "paper": ["seeds=10", "total_steps=1500000", "log_every=12500"],
@@ -127,10 +128,11 @@ STUDY = Study(
     "Navigation and Covert Communication (team and adversary with the same d); it does not say how many trials: here "
     "10. Variance is compared by Brown and Forsythe's test: seeds' distances from the median of their setting.",
     settings=settings,
-    keys={"env": "env.name", "policy_delay": "algo.policy_delay"},
+    keys=KEYS,
     claims=claims,
     draw=draw,
     options=DelayOptions,
+    beside=lambda options: {"policy_delay": KEYS} if options.quick_targets else {},
     folders=folders,
     details=lambda table: figures.finals_table(
         table,
