@@ -12,6 +12,7 @@ import sys
 import time
 from pathlib import Path
 
+import event_records
 import jax
 import numpy as np
 import pytest
@@ -263,8 +264,18 @@ def test_a_missing_checksum_file_is_damage(whole, tmp_path):
 
 def test_tensorboard_files_hold_the_table(whole, tmp_path):
     assert run(tmp_path, "name=tb", "logger=[csv,tensorboard]") == 0
-    events = list((tmp_path / "tb" / "tensorboard").glob("events*"))
-    assert len(events) == 1 and b"return_agents/seed_2" in events[0].read_bytes()
+    (path,) = (tmp_path / "tb" / "tensorboard").glob("events*")
+    written = event_records.scalars(path)
+    wanted = [
+        (int(row["step"]), f"{name}/seed_{row['seed']}", np.float32(value))
+        for row in rows(tmp_path / "tb")
+        for name, value in row.items()
+        if name not in ("step", "seed") and value != "nan"  # the losses before the first update, say
+    ]
+    assert len(wanted) > 100 and sorted(one[:2] for one in written) == sorted(one[:2] for one in wanted)
+    values = dict((one[:2], one[2]) for one in written)
+    for step, tag, value in wanted:
+        np.testing.assert_allclose(values[step, tag], value, rtol=1e-6)  # the table has nine digits
 
 
 def test_evaluate_prints_and_leaves_a_table(whole, capsys):

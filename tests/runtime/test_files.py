@@ -77,14 +77,14 @@ def test_nothing_is_written_through_links(tmp_path):
     (run / "metrics.csv").symlink_to(outside)
     files.write_text(run / "config.yaml", "mine")  # the same content, but a link
     with pytest.raises(UserError, match=r"metrics\.csv is a link"):
-        files.append_text(run / "metrics.csv", "row")
+        files.append(run / "metrics.csv", b"row")
     assert outside.read_text() == "mine" and not (run / "config.yaml").is_symlink()
 
 
 def test_appending_is_whole_or_not_at_all(tmp_path, monkeypatch):
     """A disk that takes three bytes and is full then."""
     path, real = tmp_path / "metrics.csv", os.write
-    files.append_text(path, "step,seed\n")
+    files.append(path, b"step,seed\n")
     left = [3]
 
     def few(file, data):
@@ -96,10 +96,10 @@ def test_appending_is_whole_or_not_at_all(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "write", few)
     with pytest.raises(OSError, match="No space"):
-        files.append_text(path, "100,0\n")
+        files.append(path, b"100,0\n")
     assert path.read_text() == "step,seed\n"
     left[0] = 1000
-    files.append_text(path, "100,0\n")
+    files.append(path, b"100,0\n")
     assert path.read_text() == "step,seed\n100,0\n"
 
 

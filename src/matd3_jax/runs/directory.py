@@ -170,7 +170,7 @@ class RunDirectory:
     def append(self, row: Mapping[str, np.ndarray]) -> None:
         """Add one row for each seed to the metrics table. row: columns [seeds], the same ones every time."""
         new = not self.metrics.exists() or not self.metrics.stat().st_size
-        files.append_text(self.metrics, metrics_table.row_lines(row, header=new))
+        files.append(self.metrics, metrics_table.row_lines(row, header=new).encode())
 
     def sync(self) -> None:
         """Bring the metrics table to the disk, before a checkpoint that has its rows behind it gets its name."""

@@ -73,14 +73,14 @@ def write_csv(path: Path, rows: Iterable[Sequence[Any]], line_end: str = "\r\n")
     write_text(path, file.getvalue())
 
 
-def append_text(path: Path, text: str) -> None:
-    """Add `text` to the end of a file, in UTF-8, or nothing of it where that fails.
+def append(path: Path, data: bytes) -> None:
+    """Add `data` to the end of a file, or nothing of it where that fails.
 
     Raises UserError where `path` is a link: what is behind it is not the run's.
     """
-    data = text.encode()
     try:
-        file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+        flags = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)  # of POSIX, of Windows
+        file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | flags, 0o666)
     except OSError as error:
         if error.errno == errno.ELOOP or path.is_symlink():
             raise UserError(f"{path} is a link: nothing is written through it") from error

@@ -1,5 +1,6 @@
 """Where the rows of the metrics table go while a run trains."""
 
+import contextlib
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
@@ -10,6 +11,7 @@ from matd3_jax.errors import UserError
 from matd3_jax.runs import divergence
 from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runs.divergence import Divergence
+from matd3_jax.training.event_file import EventFile
 from matd3_jax.training.rows import Row
 from matd3_jax.training.session import TrainingSession
 
@@ -47,9 +49,7 @@ class TensorBoardLogger:
 
     def __init__(self, runs: Sequence[RunDirectory], seeds: Sequence[slice] = (slice(None),)):
         self.check()
-        from tensorboardX import SummaryWriter
-
-        self.parts = [(SummaryWriter(str(run.tensorboard)), own) for run, own in zip(runs, seeds, strict=True)]
+        self.parts = [(EventFile(run.tensorboard), own) for run, own in zip(runs, seeds, strict=True)]
 
     @staticmethod
     def check() -> None:
@@ -62,16 +62,18 @@ class TensorBoardLogger:
             ) from None
 
     def log(self, row: Row) -> None:
-        for writer, own in self.parts:
-            for name, values in row.items():
-                if name in ("step", "seed") or np.isnan(values[own]).all():
-                    continue
-                for seed, value in zip(row["seed"][own], values[own], strict=True):
-                    writer.add_scalar(f"{name}/seed_{seed}", value, int(row["step"][0]))
+        with contextlib.ExitStack() as each:  # an error of one folder keeps nothing from the others
+            for events, own in self.parts:
+                scalars = {
+                    f"{name}/seed_{seed}": float(value)
+                    for name, values in row.items()
+                    if name not in ("step", "seed") and not np.isnan(values[own]).all()
+                    for seed, value in zip(row["seed"][own], values[own], strict=True)
+                }
+                each.callback(events.write, scalars, int(row["step"][0]))
 
     def close(self) -> None:
-        for writer, _ in self.parts:
-            writer.close()
+        pass
 
 
 class DivergenceLogger:
