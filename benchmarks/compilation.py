@@ -46,7 +46,7 @@ COMMAND = Command("python -m benchmarks.compilation", Options, __doc__, usage=("
 def main(argv: Sequence[str]) -> int:
     overrides = COMMAND.parse(argv).overrides
     devices.prepare()
-    settings = config.load(overrides)
+    settings = config.load(overrides, COMMAND.keys)
     settings = config.load([f"replay_capacity={settings.learning_starts}", *overrides])
     imported = time.perf_counter() - BEGUN
     programs = {}

@@ -357,7 +357,8 @@ def roofline(trainer: TrainLoop, repeats: int = 5, part: str = "loop") -> tuple[
 def main(argv: Sequence[str]) -> int:
     options = COMMAND.parse(argv)
     devices.prepare()
-    settings = config.load([f"seeds={options.seeds}", "total_steps=100000", "eval_every=0", *options.overrides])
+    line = [f"seeds={options.seeds}", "total_steps=100000", "eval_every=0", *options.overrides]
+    settings = config.load(line, COMMAND.keys)
     trainer = TrainingSession(settings).trainer
     report: dict[str, Any] = {"machine": devices.description(), "versions": devices.versions()}
     report |= {"commit": commit(), "settings": list(argv)}

@@ -48,7 +48,7 @@ COMMAND = Command("python -m benchmarks.loop", Options, __doc__)
 def main(argv: Sequence[str]) -> int:
     options = COMMAND.parse(argv)
     devices.prepare()
-    loop = Loop(config.load(options.overrides))
+    loop = Loop(config.load(options.overrides, COMMAND.keys))
     calls = loop.calls(options.seconds)
     times = [loop.iteration_seconds(calls) for _ in range(options.repeats)]
     trainer = loop.trainer

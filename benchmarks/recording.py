@@ -52,7 +52,7 @@ COMMAND = Command("python -m benchmarks.recording", Options, __doc__)
 def main(argv: Sequence[str]) -> int:
     options = COMMAND.parse(argv)
     devices.prepare()
-    settings = config.load([*options.overrides])
+    settings = config.load(options.overrides, COMMAND.keys)
     training = TrainingSession(settings)
     training.check_memory()
     with tempfile.TemporaryDirectory(dir=options.folder, prefix="recording-") as folder:

@@ -39,7 +39,8 @@ COMMAND = Command("python -m benchmarks.robots", Options, __doc__)
 def main(argv: Sequence[str]) -> int:
     options = COMMAND.parse(argv)
     devices.prepare()
-    envs.make(**config.load([f"env={options.env}", *options.overrides]).env)  # before JAX computes, as in `throughput`
+    settings = config.load([f"env={options.env}", *options.overrides], COMMAND.keys)
+    envs.make(**settings.env)  # before JAX computes, as in `throughput`
     report: dict[str, Any] = {
         "machine": devices.description(),
         "versions": devices.versions(),

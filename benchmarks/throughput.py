@@ -50,7 +50,7 @@ COMMAND = Command("python -m benchmarks.throughput", Options, __doc__)
 def main(argv: Sequence[str]) -> int:
     options = COMMAND.parse(argv)
     devices.prepare()
-    envs.make(**config.load(options.overrides).env)  # before JAX computes: it may ask XLA for threads
+    envs.make(**config.load(options.overrides, COMMAND.keys).env)  # before JAX computes: it may ask XLA for threads
     report: dict[str, Any] = {
         "machine": devices.description(),
         "versions": devices.versions(),

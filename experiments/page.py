@@ -84,6 +84,8 @@ def main(argv: Sequence[str]) -> int:
         text = options.page.read_text(encoding="utf-8")
     except OSError as error:
         raise UserError(f"page={options.page}: {error.strerror}") from error
+    if not options.results.is_dir():
+        raise UserError(f"results={options.results}: there is no such folder")
     paper = [entry for one in STUDIES.values() for entry in entries(one, options.results)]
     ours = [entry for one in OURS.values() for entry in entries(one, options.results) if entry.folder]
     ours += strangers(options.results)

@@ -312,7 +312,8 @@ def _wanted(study: Study, options: StudyOptions) -> dict[str, Config]:
     """The study's settings by label. Raises UserError for overrides that it does not take."""
     overrides = _overrides(options)
     lines = _checked(study, options, overrides)
-    return {label: _load(tuple(config.merge(line, overrides))) for label, line in lines.items()}
+    known = study.command.keys
+    return {label: _load(tuple(config.merge(line, overrides)), known) for label, line in lines.items()}
 
 
 def _checked(study: Study, options: StudyOptions, overrides: Sequence[str]) -> dict[str, list[str]]:
@@ -347,8 +348,8 @@ def key_values(keys: Mapping[str, str], line: Sequence[str]) -> dict[str, Any]:
 
 
 @functools.cache
-def _load(overrides: tuple[str, ...]) -> Config:
-    return config.load(overrides)
+def _load(overrides: tuple[str, ...], known: tuple[str, ...] = ()) -> Config:
+    return config.load(overrides, known)
 
 
 def _recorded(argv: Sequence[str]) -> list[str]:

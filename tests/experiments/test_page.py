@@ -59,6 +59,9 @@ def test_a_page_without_marks_is_left_alone(tmp_path):
     with pytest.raises(UserError, match="the marks .* must be there once"):
         page.main(argv)
     assert [path.name for path in tmp_path.iterdir()] == ["page.md"]
+    with pytest.raises(UserError, match="results=.*/nowhere: there is no such folder"):
+        page.main([f"results={tmp_path / 'nowhere'}", *argv[1:]])
+    assert (tmp_path / "page.md").read_text() == "nothing"
     with pytest.raises(UserError, match="No such file"):
         page.main([*argv[:1], f"page={tmp_path / 'other.md'}", argv[2]])
 

@@ -256,6 +256,7 @@ def test_all_makes_one_summary(tmp_path, monkeypatch):
         (["algo=td3"], "cannot take algo= here: the study itself varies it"),
         (["name=mine"], "cannot take name= here"),
         (["learning_rate=0.1"], "there is no key 'learning_rate'"),
+        (["at_ones=2"], "there is no key 'at_ones'; did you mean 'at_once'"),
         (["train=false"], "there is no run to report"),
     ],
 )
