@@ -186,7 +186,7 @@ def test_seeds_of_several_directories_are_one_setting(tmp_path):
 
 
 def test_what_another_study_has_trained_is_taken_over(tmp_path):
-    """Rows of the same settings and of wanted seeds alone, told apart by the columns of their own study, whose hours
+    """Rows of the same settings and of wanted seeds alone, selected by the columns of their own study, whose hours
     count once."""
     runs, out = tmp_path / "runs", tmp_path / "results" / "target_smoothing"
     for k, (label, line) in enumerate(policy_delay.settings("paper", DelayOptions()).items()):

@@ -33,8 +33,8 @@ def test_scalars_are_read_as_they_were_written(tmp_path):
 def test_a_full_disk_costs_its_rows_and_nothing_else(tmp_path, monkeypatch, room):
     """One warning, never waiting; what comes when there is room again can be read."""
     runs = [RunDirectory(tmp_path / name) for name in ("full", "other")]
-    told, real, full = [], os.write, [False]
-    logger = Harmless(TensorBoardLogger(runs, [slice(0, 1), slice(1, 2)]), told.append)
+    warnings, real, full = [], os.write, [False]
+    logger = Harmless(TensorBoardLogger(runs, [slice(0, 1), slice(1, 2)]), warnings.append)
 
     def write(file, data):
         if not full[0] or "/other/" in os.readlink(f"/proc/self/fd/{file}"):
@@ -49,7 +49,7 @@ def test_a_full_disk_costs_its_rows_and_nothing_else(tmp_path, monkeypatch, room
         columns = {f"column_{k}": np.array([k + step, np.nan]) for k in range(20)}
         logger.log({"step": np.full(2, step), "seed": np.arange(2), "x": np.array([step, step]), **columns})
     logger.close()
-    (warning,) = told
+    (warning,) = warnings
     assert warning.startswith("warning: TensorBoardLogger fails, the run goes on: ") and "No space left" in warning
     found = [event_records.scalars(next(run.tensorboard.glob("events*"))) for run in runs]
     assert {step for step, *_ in found[0]} == {*([] if room == 0 else [0]), *range(30, 40)}
