@@ -12,11 +12,8 @@ from pathlib import Path
 from matd3_jax.cli import catalog, options
 from matd3_jax.cli.options import Command
 from matd3_jax.errors import OptionError, UserError
-from matd3_jax.runtime import outside
+from matd3_jax.runtime import interrupt, outside
 from matd3_jax.runtime.terminal import complain, leave, say
-
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
 
 DIVERGED = 3
 """Exit code where all seeds diverged, or one did that ended the run (docs/running.md)."""
@@ -27,8 +24,9 @@ def start(name: str, argv: Sequence[str]) -> int:
     if options.asks_for_help(argv):
         say(catalog.COMMANDS[name].help())
         return 0
-    module = importlib.import_module(f"matd3_jax.cli.{name}")
-    from matd3_jax.runtime import devices  # imports JAX, which help does without
+    with interrupt.ends_at_once():
+        module = importlib.import_module(f"matd3_jax.cli.{name}")
+        from matd3_jax.runtime import devices  # imports JAX, which help does without
 
     with devices.standard_numerics():
         return module.main(argv)
@@ -37,6 +35,7 @@ def start(name: str, argv: Sequence[str]) -> int:
 def code(main: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     """Run a command's `main`: its exit code, or 2 after an error line; a fault of our own passes."""
     outside.leave_out_late_callbacks()
+    interrupt.is_not_lost()
     try:
         return main(argv)
     except (UserError, OptionError) as error:
@@ -44,7 +43,7 @@ def code(main: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
         return 2
     except KeyboardInterrupt:
         complain("interrupted")
-        return INTERRUPTED
+        return interrupt.EXIT_CODE
     except Exception as error:
         line = outside.describe(error)
         if line is None:

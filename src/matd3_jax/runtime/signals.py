@@ -1,4 +1,4 @@
-"""SIGINT, SIGTERM and SIGHUP as a wish to stop soon."""
+"""SIGINT, SIGTERM and SIGHUP as a wish to stop soon, but for those that whoever started the program has it ignore."""
 
 import signal
 import sys
@@ -11,7 +11,10 @@ NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
 
 
 class Stop:
-    """The signals end the run after the interval at work; a second one ends it at once."""
+    """The signals end the run after the interval at work; a second one ends it at once.
+
+    What is ignored already stays so: SIGHUP under nohup, SIGINT in the background of a script.
+    """
 
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None
@@ -19,8 +22,9 @@ class Stop:
         # A handler runs between any two operations, in the middle of a print, too: it only notes what came.
         threading.Thread(target=self._tell, daemon=True).start()
         for name in NAMES:
-            if hasattr(signal, name):
-                signal.signal(getattr(signal, name), self._remember)
+            number = getattr(signal, name, None)
+            if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, self._remember)
 
     def agreed(self, processes: Processes) -> signal.Signals | None:
         """The signal that has come to any of the processes, if any has; all get the same answer."""
