@@ -50,7 +50,7 @@ def main(argv: Sequence[str]) -> int:
     overrides = [*SHORT, *options.overrides, f"seeds={options.seeds}"]
     if not SearchSpace.parse(overrides).axes:
         overrides += SWEPT
-    _, settings = sweep.read(overrides, None, 0)
+    _, settings = sweep.read(overrides, None, 0, COMMAND.keys)
     groups: dict[str, list[Config]] = {}
     for setting in settings.values():
         groups.setdefault(batching.program(setting), []).append(setting)

@@ -143,17 +143,19 @@ def arguments(task: str, method: str, options: PopulationOptions) -> list[str]:
     line += [f"log_every={every}", f"eval_every={every}", *METHODS[method]]
     line += [f"pbt_every={every}"] if METHODS[method] else []
     line += [f"pbt_start={START[task]}"] if method == LATER else []
-    _check(options.overrides)
+    _check(task, options.overrides)
     return config.merge(line, options.overrides)
 
 
-def _check(overrides: Sequence[str]) -> None:
-    """Raise UserError for an override of what the experiment sets."""
+def _check(task: str, overrides: Sequence[str]) -> None:
+    """Raise UserError for an override of what the experiment sets, and for what is no setting of the task's."""
     swept = {text.partition("=")[0] for line in TASKS.values() for text in line if "interval(" in text}
     own = {"seeds", "total_steps", "log_every", "eval_every", "name", "out", *swept}
     for override in config.parse(overrides):
         if override.key_or_group in own:
             raise UserError(f"cannot take {override.key_or_group}= here: the experiment sets it itself")
+    fixed = [text for text in TASKS[task] if "interval(" not in text]
+    config.load(config.merge(fixed, overrides), COMMAND.keys)
 
 
 def batch(key: tuple[str, str], line: Sequence[str]) -> Batch:

@@ -122,6 +122,8 @@ def test_methods_differ_in_nothing_else():
         (["only=simple_tag"], "matches none of"),
         (["algo.tau=0.1"], "cannot take algo.tau= here"),
         (["seeds=3"], "cannot take seeds= here"),
+        (["membrs=4"], "no key 'membrs'; did you mean 'members'"),
+        (["algo.lrr=4"], "no key 'algo.lrr'"),
         (["train=false"], "nothing to report"),
     ],
 )

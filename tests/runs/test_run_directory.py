@@ -1,6 +1,8 @@
 """Run directories have a format, know what a killed write left, and are not written through links."""
 
 import json
+import os
+import time
 
 import pytest
 
@@ -65,6 +67,18 @@ def test_what_killed_writes_left_is_removed_and_nothing_else(run, tmp_path):
     run.clean()
     assert {path.name for path in run.path.iterdir()} == {*kept, "config.yaml", "machine.json"}
     assert (elsewhere / "a").exists()
+
+
+def test_a_new_run_removes_those_that_a_kill_kept_from_their_names(tmp_path):
+    """None that may still be made, and nothing else."""
+    names = {".run.12.partial": 2, ".run.13.partial": 0, ".film.12.partial": 2, "run.12.partial": 2}  # age, days
+    for name, days in names.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.yaml").write_text("")
+        then = time.time() - days * 24 * 60 * 60 - 60
+        os.utime(tmp_path / name, (then, then))
+    RunDirectory.create(tmp_path / "new", config.load(), {})
+    assert {path.name for path in tmp_path.iterdir()} == {*names, "new"} - {".run.12.partial"}
 
 
 @pytest.mark.parametrize("name", ["metrics.csv", "checkpoints", "tensorboard", "videos", "wandb"])

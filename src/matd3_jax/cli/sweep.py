@@ -145,17 +145,19 @@ def check_metric(settings: Iterable[Config], metric: str) -> None:
             raise UserError(f"metric={metric}: the metrics table has no such column; {nearest(metric, columns)}")
 
 
-def read(overrides: Sequence[str], samples: int | None, seed: int) -> tuple[list[dict[str, str]], dict[str, Config]]:
+def read(
+    overrides: Sequence[str], samples: int | None, seed: int, known: Sequence[str] = catalog.SWEEP.keys
+) -> tuple[list[dict[str, str]], dict[str, Config]]:
     """The settings of a sweep: swept values {key: value in Hydra's grammar} of each, and its checked configuration by
-    name. Raises UserError, naming the setting where it is one combination that is impossible."""
+    name. known: keys that the command takes itself (see `config.load`).
+
+    Raises UserError, naming the setting where it is one combination that is impossible."""
     space = SearchSpace.parse(overrides)
     chosen = space.grid() if samples is None else space.sample(samples, seed)
     settings = {}
     for name, values in zip(search_space.names(space.axes, chosen), chosen, strict=True):
         try:
-            settings[name or "run"] = config.load(
-                [*space.fixed, *(f"{k}={v}" for k, v in values.items())], catalog.SWEEP.keys
-            )
+            settings[name or "run"] = config.load([*space.fixed, *(f"{k}={v}" for k, v in values.items())], known)
         except UserError as error:
             swept = ", ".join(f"{key}={value}" for key, value in values.items())
             raise UserError(f"{error} (with {swept})" if values else str(error)) from error

@@ -100,6 +100,7 @@ class RunDirectory:
                             raise  # else another process was quicker
                     else:
                         files.sync_folder(path.parent)
+                        files.remove_abandoned(path.parent, ".run.*.partial")
                         return cls(tried)
                 if not or_another:
                     raise UserError(_there(path))

@@ -9,6 +9,7 @@ import math
 import os
 import re
 import shutil
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,9 @@ from matd3_jax.errors import UserError
 
 PARTIAL = re.compile(r"\..+\.\d+\.partial(\.\w+)?")
 """Names of the files that `replacing` writes, and of new directories of runs, until they get their own."""
+
+ABANDONED = 24 * 60 * 60
+"""Age in seconds from which nobody writes to a partial file any more; clocks of machines that share it may differ."""
 
 
 @contextlib.contextmanager
@@ -45,10 +49,25 @@ def partial(folder: Path) -> list[Path]:
 def remove_partial(folder: Path) -> None:
     """Delete what `partial` finds; nobody else may write there now."""
     for path in partial(folder):
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
+        _remove(path)
+
+
+def remove_abandoned(folder: Path, pattern: str) -> None:
+    """Delete what `partial` finds under names of a glob pattern, where others may write, once it is a day old.
+
+    What cannot be deleted stays.
+    """
+    for path in partial(folder):
+        with contextlib.suppress(OSError):
+            if path.match(pattern) and time.time() - path.lstat().st_mtime > ABANDONED:
+                _remove(path)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:

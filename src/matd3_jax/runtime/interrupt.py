@@ -34,8 +34,8 @@ def ends_at_once() -> Iterator[None]:
 
 
 def is_not_lost() -> None:
-    """Raise KeyboardInterrupt once more where it came in a callback (of the garbage collector, say): Python prints those
-    as ignored and goes on."""
+    """Raise KeyboardInterrupt once more where it came in a callback, of the garbage collector, say: Python prints it as
+    ignored there and goes on."""
     before = sys.unraisablehook
     if getattr(before, "raises_interrupts", False):
         return

@@ -1,7 +1,6 @@
 """What a run directory holds and what is damaged in it. Nothing is changed."""
 
 import dataclasses
-import json
 from pathlib import Path
 
 from matd3_jax.config import Config
@@ -99,7 +98,7 @@ def of_run(path: Path) -> Condition:
     gaps = tuple(expected.gaps(table, done))
     if (run.path / "summary.json").exists() and run.summary() is None:
         problems.append(f"{run.path / 'summary.json'} is not whole: a resume makes it again")
-    if not _readable(run.path / "machine.json"):
+    if not run.machine():
         problems.append(f"{run.path / 'machine.json'} is missing or not whole: versions and devices are lost")
     if starting.needed(settings) and not whole:
         try:
@@ -118,10 +117,3 @@ def _expected(settings: Config, table: MetricsTable) -> Expected:
         return TrainingSession(settings).expected_table(settings)
     except (UserError, OptionError):  # an environment of one's own, or one that is not installed here
         return Expected(table.header, settings.seed_numbers, first=0, interval=0)
-
-
-def _readable(path: Path) -> bool:
-    try:
-        return isinstance(json.loads(path.read_text(encoding="utf-8")), dict)
-    except (OSError, ValueError, RecursionError):
-        return False
