@@ -108,6 +108,8 @@ def draw(table: Table, path: Path) -> None:
     panels = [("simple_spread", "return_agents", "return"), ("simple_crypto", "return_agents", "team's return")]
     panels += [("simple_crypto", "return_adversaries", "adversary's return")]
     panels = [panel for panel in panels if panel[0] in table.values("env")]
+    several = [panel for panel in panels if len(table.where(env=panel[0]).values("policy_delay")) > 1]
+    panels = several or panels  # what another study trained of a task this one did not is no comparison
     figure, axes = figures.canvas(len(panels), width=4.0)
     for axis, (env, column, label) in zip(axes, panels, strict=True):
         for d, color in zip(DELAYS, SERIES, strict=False):
