@@ -41,6 +41,10 @@ def main(argv):
 command.run(main)
 """
 
+A_SECOND_SIGNAL = IN_A_CALLBACK.replace("import os", "from matd3_jax.runtime.signals import Stop\nimport os").replace(
+    "    Collected()", "    stop = Stop()\n    os.kill(os.getpid(), signal.SIGHUP)\n    Collected()"
+)
+
 
 def ended(program: str) -> subprocess.CompletedProcess:
     return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
@@ -50,6 +54,12 @@ def ended(program: str) -> subprocess.CompletedProcess:
 def test_nothing_swallows_it(program):
     done = ended(program)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
+
+
+def test_a_second_signal_is_not_swallowed():
+    done = ended(A_SECOND_SIGNAL)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGINT, "")
+    assert "SIGHUP: writing a checkpoint" in done.stdout
 
 
 def test_python_has_its_handler_back():

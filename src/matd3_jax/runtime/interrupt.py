@@ -13,7 +13,7 @@ EXIT_CODE = 130
 """After Ctrl-C, as shells have it."""
 
 _PAUSE = 0.05
-"""Seconds until a lost interrupt is raised once more: callbacks are short."""
+"""Seconds until a lost signal comes once more: callbacks are short."""
 
 
 @contextlib.contextmanager
@@ -34,26 +34,38 @@ def ends_at_once() -> Iterator[None]:
 
 
 def is_not_lost() -> None:
-    """Raise KeyboardInterrupt once more where it came in a callback, of the garbage collector, say: Python prints it as
-    ignored there and goes on."""
+    """Have a signal come once more where its handler raised in a callback, of the garbage collector, say: Python prints
+    that as ignored and goes on.
+
+    Handlers raise KeyboardInterrupt (Python's own) or SystemExit of 128 + N (`signals.Stop` at a second signal N).
+    """
     before = sys.unraisablehook
-    if getattr(before, "raises_interrupts", False):
+    if getattr(before, "repeats_signals", False):
         return
 
     def hook(found: Any) -> None:
-        if not isinstance(found.exc_value, KeyboardInterrupt):
+        number = _signal(found.exc_value)
+        if number is None:
             before(found)
             return
-        timer = threading.Timer(_PAUSE, _thread.interrupt_main)
+        timer = threading.Timer(_PAUSE, _thread.interrupt_main, (number,))
         timer.daemon = True
         timer.start()
 
-    hook.raises_interrupts = True  # type: ignore[attr-defined]
+    hook.repeats_signals = True  # type: ignore[attr-defined]
     sys.unraisablehook = hook
 
 
 def _in_the_main_thread() -> bool:
     return threading.current_thread() is threading.main_thread()
+
+
+def _signal(error: object) -> int | None:
+    """The signal for which a handler raised an error; None: it was raised by no handler."""
+    if isinstance(error, KeyboardInterrupt):
+        return signal.SIGINT
+    code = error.code if isinstance(error, SystemExit) else None
+    return code - 128 if isinstance(code, int) and code > 128 else None
 
 
 def _end(number: int, frame: object) -> None:
