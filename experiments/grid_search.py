@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import figures, markdown, study, tidy, verdict
+from experiments import factorial, figures, markdown, study, tidy, verdict
 from experiments.study import RESULTS, Study, StudyOptions
 from experiments.tidy import Table
 from experiments.verdict import Claim
@@ -19,6 +19,7 @@ from matd3_jax.cli import command
 from matd3_jax.cli.options import option
 from matd3_jax.errors import UserError
 from matd3_jax.figures.style import SERIES
+from matd3_jax.stats.text import ends, number
 
 RATES = (0.01, 0.003, 0.001)
 GRIDS = {
@@ -142,7 +143,24 @@ def details(table: Table) -> list[str]:
     for k, (point, final, along) in enumerate(ranking(table)):
         cells = [str(k + 1), *(f"{point[key]:g}" for key in wanted), str(len(final)), figures.interval(final)]
         rows.append([*cells, figures.interval(along)])
-    return markdown.table(head, rows)
+    return [*markdown.table(head, rows), *effects(table)]
+
+
+def effects(table: Table) -> list[str]:
+    """A table of what each value of a setting does against the next smaller one, the others alike."""
+    keys = list(best(table))
+    cells = {tuple(point[key] for key in keys): final for point, final, _ in ranking(table)}
+    rows = []
+    for place, key in enumerate(keys):
+        for a, b in factorial.neighbors([point[place] for point in cells]):
+            found = factorial.effect(cells, place, a, b)
+            if found is not None:
+                numbers = f"{number(found.estimate)} ({ends(found.low, found.high)})"
+                rows.append([f"{key} {a:g} minus {key} {b:g}", numbers, f"{found.p:.2g}"])
+    if not rows:
+        return []
+    words = "Each setting against its next smaller value, mean over all points of the grid that differ in nothing else:"
+    return ["", words, "", *markdown.table(("setting", "final return (95 % interval)", "p"), rows)]
 
 
 STUDY = Study(

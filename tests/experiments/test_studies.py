@@ -186,7 +186,11 @@ def test_grid_search(tmp_path):
     (claim,) = grid_search.claims(made(15.5))
     assert claim.verdict == "opposite" and "3 of 18" in claim.found and "lr 0.001, batch 1000, d 3" in claim.quantity
     assert grid_search.details(made(30.0))[2].startswith("| 1 | 0.01 | 1000 | 2 | 4 | 30 ")
+    lines = grid_search.effects(made(4.0))  # returns rise by 1 with each point of the grid
+    (batch,) = (line for line in lines if "batch 1000 minus batch 256" in line)
+    assert batch.startswith("| batch 1000 minus batch 256 | 3 (2.")
     grid_search.draw(made(30.0), tmp_path / "figure.png")
+    assert grid_search.details(Table({}))[:1] == grid_search.details(made(30.0))[:1]
     assert grid_search.claims(Table({}))[0].verdict == "not yet run"
 
 
