@@ -41,7 +41,7 @@ SETTINGS = [
 TRAIN = [*SETTINGS, "total_steps=600", "checkpoint_every=200", "keep_checkpoints=3"]
 SWEEP = [*SETTINGS, "total_steps=400", "checkpoint_every=100", "algo.lr=0.01,0.001"]
 SAME, SAID, LOST = "resumed to the same bits", "refused in one line", "LOST"
-KINDS = 17
+KINDS = 18
 """How many `Torture.trials` there are."""
 ERRORS = slice(8, 14)
 """Those of errors and damaged files."""
@@ -146,8 +146,10 @@ class Torture:
             how = "-"
         elif ended.code is None:
             how = "killed"
-        elif "Traceback" in ended.output:
+        elif "Traceback" in ended.output or "Exception ignored" in ended.output:
             how, outcome, detail = "ended with a traceback", LOST, detail or ended.output[-1500:]
+        elif ended.code > 128:
+            how = "stopped by the signal"
         else:
             how = "came to its end" if ended.code == 0 else "ended with one line"
         self.table[fault, how, outcome] += 1
@@ -213,6 +215,15 @@ class Torture:
         at = self.rng.randrange(sum(bool(re.search(pattern, call)) for call in self.calls))
         ended = self.run(Job(self.train(path), path.parent, how, at, pattern))
         self.settle({"short": "short write"}.get(how, how), path, ended)
+
+    def signal_at_a_call(self) -> None:
+        """A wish to stop, or two of them, wherever the run is."""
+        path, how = self.path(), self.rng.choice(faults.SIGNALS)
+        ended = self.run(Job(self.train(path), path.parent, how, self.rng.randrange(len(self.calls))))
+        number = getattr(signal, how.split()[0])
+        if ended.code not in (None, 0, 128 + number):  # killed: it came before the run heeds signals, or after
+            return self.note(how, ended, LOST, f"exit code {ended.code}: {ended.output[-1500:]}")
+        self.settle(how, path, ended)
 
     def file_limit(self) -> None:
         """No file may grow beyond some bytes: fails in Orbax's C++, too."""
@@ -353,7 +364,7 @@ class Torture:
             there(self.error_at_a_call, "EIO", "open write fsync replace rename"),
             there(self.error_at_a_call, "short", "write"),
             self.file_limit, self.damage_a_checkpoint, self.damage_another_file, self.two_at_once,
-            self.kill_a_plan, self.kill_a_sweep,
+            self.kill_a_plan, self.kill_a_sweep, self.signal_at_a_call,
         ]  # fmt: skip
         assert len(found) == KINDS
         return found

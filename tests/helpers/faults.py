@@ -16,7 +16,10 @@ from typing import Any
 ERRORS = {"ENOSPC": errno.ENOSPC, "EIO": errno.EIO}
 """A full disk stays full until the process ends; an error of a device comes once."""
 
-INJECTED = ("short", *ERRORS)
+SIGNALS = tuple(f"{name}{more}" for name in ("SIGINT", "SIGTERM", "SIGHUP") for more in ("", " twice"))
+"""What asks a process to stop; twice: at once."""
+
+INJECTED = ("short", *ERRORS, *SIGNALS)
 """What a process survives."""
 
 WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT
@@ -28,8 +31,8 @@ class Faults:
     Args:
         log: gets a line "CALL PATH" before each call, so that it is known where a process died.
         how: "kill" (before the call), "kill after", "half" (half of what is written, then killed), "power" (killed, and
-            of every file is left what was synced), "short" (half of it, as a system may write), one of `ERRORS`; "":
-            nothing.
+            of every file is left what was synced), "short" (half of it, as a system may write), one of `ERRORS` or
+            `SIGNALS`; "": nothing.
         at: number of the call, from 0, among those that `where` matches, a pattern for "CALL PATH".
     """
 
@@ -66,6 +69,10 @@ class Faults:
             self._lose_what_is_not_synced()
         if due in ("kill", "power") or (due == "half" and call != "write"):
             os.kill(os.getpid(), signal.SIGKILL)
+        if due in SIGNALS:
+            name, _, more = due.partition(" ")
+            for _ in range(2 if more else 1):
+                os.kill(os.getpid(), getattr(signal, name))
         if due in ERRORS and call in ("open", "write", "mkdir", "fsync", "replace", "rename"):
             if due == "EIO" or call in ("open", "write", "mkdir"):
                 raise OSError(ERRORS[due], os.strerror(ERRORS[due]), path)
