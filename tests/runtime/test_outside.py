@@ -4,7 +4,6 @@ import errno
 import os
 import subprocess
 import sys
-import types
 
 import numpy as np
 import pytest
@@ -102,14 +101,3 @@ def test_a_platform_that_is_not_there():
         pytest.skip("there is a GPU")
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert done.stderr.splitlines()[-1].startswith("error: JAX cannot start JAX_PLATFORMS=cuda")
-
-
-def test_callbacks_after_their_event_loop_are_left_out(monkeypatch):
-    """What Orbax's futures print after a checkpoint failed; every other error is printed as before, once."""
-    printed = []
-    monkeypatch.setattr(sys, "unraisablehook", lambda found: printed.append(found.exc_value))
-    outside.leave_out_late_callbacks()
-    outside.leave_out_late_callbacks()
-    for error in (RuntimeError("Event loop is closed"), RuntimeError("another"), ValueError("Event loop is closed")):
-        sys.unraisablehook(types.SimpleNamespace(exc_value=error))
-    assert [repr(error) for error in printed] == ["RuntimeError('another')", "ValueError('Event loop is closed')"]

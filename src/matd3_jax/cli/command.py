@@ -12,7 +12,7 @@ from pathlib import Path
 from matd3_jax.cli import catalog, options
 from matd3_jax.cli.options import Command
 from matd3_jax.errors import OptionError, UserError
-from matd3_jax.runtime import interrupt, outside
+from matd3_jax.runtime import callbacks, interrupt, outside
 from matd3_jax.runtime.terminal import complain, leave, say
 
 DIVERGED = 3
@@ -34,8 +34,7 @@ def start(name: str, argv: Sequence[str]) -> int:
 
 def code(main: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     """Run a command's `main`: its exit code, or 2 after an error line; a fault of our own passes."""
-    outside.leave_out_late_callbacks()
-    interrupt.is_not_lost()
+    callbacks.handle_errors()
     try:
         return main(argv)
     except (UserError, OptionError) as error:

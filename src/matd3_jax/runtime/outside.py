@@ -2,9 +2,7 @@
 
 import os
 import re
-import sys
 import traceback
-from typing import Any
 
 import matd3_jax
 from matd3_jax.errors import one_line
@@ -14,24 +12,6 @@ _ON_HOST = re.compile(r"\bHostError: (.*)")
 """How JAX passes on what an environment on the host raised while a compiled program ran."""
 _FILE = re.compile(r'Failed \w+: "([^"]+)"')
 """How tensorstore, which writes checkpoints, passes an error of the system on, and which file it names."""
-
-
-def leave_out_late_callbacks() -> None:
-    """Have Python print no traceback of a callback that comes after its event loop.
-
-    Where writing a checkpoint fails, Orbax ends its event loop before all writes of tensorstore have, whose ends are
-    then errors of their own; the one that counts is raised.
-    """
-    before = sys.unraisablehook
-    if getattr(before, "leaves_out_late_callbacks", False):
-        return
-
-    def hook(found: Any) -> None:
-        if not (isinstance(found.exc_value, RuntimeError) and str(found.exc_value) == "Event loop is closed"):
-            before(found)
-
-    hook.leaves_out_late_callbacks = True  # type: ignore[attr-defined]
-    sys.unraisablehook = hook
 
 
 def describe(error: BaseException) -> str | None:
