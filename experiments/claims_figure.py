@@ -52,6 +52,8 @@ SHORT: dict[str, tuple[str, ...]] = {
     "number_of_agents": (
         "MADDPG: number of agents does not matter",
         "MATD3: number of agents does not matter",
+        "MADDPG: the same beyond the targets' lag",
+        "MATD3: the same beyond the targets' lag",
     ),
     "grid_search": ("lr 0.01, batch 1000, d 2 work best",),
     "ant": (

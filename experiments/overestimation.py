@@ -63,8 +63,12 @@ def beyond(table: Table) -> np.ndarray | None:
     found, start = measured(table), lag(table)
     if found is None or start is None:
         return None
-    rest = found[1] - found[2] - start
-    return rest[:, rest.shape[1] // 3 :].mean(axis=1)
+    return last_two_thirds(found[1] - found[2] - start).mean(axis=1)
+
+
+def last_two_thirds(values: np.ndarray) -> np.ndarray:
+    """The last two thirds of [seeds, points]."""
+    return values[:, values.shape[1] // 3 :]
 
 
 def claims(table: Table) -> list[Claim]:

@@ -160,12 +160,36 @@ def test_number_of_agents(tmp_path):
         return table_of(rows)
 
     flat = number_of_agents.claims(made(0.0))
-    assert verdicts(flat) == ["same", "same"] and flat[0].difference.estimate == pytest.approx(0, abs=1e-9)
+    assert verdicts(flat) == ["same", "same", "not yet run", "not yet run"]
+    assert flat[0].difference.estimate == pytest.approx(0, abs=1e-9)
     steep = number_of_agents.claims(made(0.2))
-    assert verdicts(steep) == ["opposite"] * 2 and steep[0].difference.estimate == pytest.approx(0.2)
+    assert verdicts(steep)[:2] == ["opposite"] * 2 and steep[0].difference.estimate == pytest.approx(0.2)
     assert "+50.0 % (2 agents)" in steep[0].found
-    assert verdicts(number_of_agents.claims(made(0.0, spread=0.3))) == ["not shown"] * 2
+    assert verdicts(number_of_agents.claims(made(0.0, spread=0.3)))[:2] == ["not shown"] * 2
     number_of_agents.draw(made(0.1), tmp_path / "figure.png")
+
+
+def test_number_of_agents_beyond_the_lag(tmp_path):
+    """What lags behind while the targets move, and whatever was in the first third, does not count."""
+    rows = {}
+    for algo, slope, delay in (("maddpg", 0.2, 1), ("matd3", 0.0, 2)):
+        for n in (2, 3, 4):
+            keys = (("algo", algo), ("num_agents", n), ("tau", 0.01), ("gamma", 0.95), ("d", delay))
+            over = 20 * (slope * n + 0.01 * NOISE)
+            setting = bias_table(over, over, NOISE, keys)
+            start = overestimation.lag(table_of(setting))[0]
+            first = [7.0 * n, 3.0 * n, *[0.0] * 4]
+            values = setting[keys]["q_estimate"]
+            setting[keys]["q_estimate"] = [
+                values[0],
+                *(v + s + f for v, s, f in zip(values[1:], start, first, strict=True)),
+            ]
+            rows |= setting
+    found = number_of_agents.claims(table_of(rows))[2:]
+    assert verdicts(found) == ["opposite", "same"]
+    assert found[0].difference.estimate == pytest.approx(0.2) and "+80.0 % (4 agents)" in found[0].found
+    assert len(number_of_agents.details(table_of(rows))) == 2 + 6
+    number_of_agents.draw(table_of(rows), tmp_path / "figure.png")
 
 
 def test_grid_search(tmp_path):
