@@ -31,6 +31,6 @@ def described(error: BaseException) -> str:
 
 def nearest(word: object, known: Iterable[str]) -> str:
     """The end of an error message: what was probably meant, or else everything that is known."""
-    known = sorted(known)
+    known = sorted(set(known))
     close = difflib.get_close_matches(str(word), known, n=3, cutoff=0.5)
     return f"did you mean {' or '.join(repr(name) for name in close)}?" if close else f"known: {', '.join(known)}"

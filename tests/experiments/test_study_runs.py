@@ -257,6 +257,7 @@ def test_all_makes_one_summary(tmp_path, monkeypatch):
         (["name=mine"], "cannot take name= here"),
         (["learning_rate=0.1"], "there is no key 'learning_rate'"),
         (["at_ones=2"], "there is no key 'at_ones'; did you mean 'at_once'"),
+        (["sedes=2"], r"there is no key 'sedes'; did you mean 'seeds' or 'seed'\?"),  # a setting and an option: once
         (["train=false"], "there is no run to report"),
     ],
 )
