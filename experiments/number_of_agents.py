@@ -106,6 +106,7 @@ def draw(table: Table, path: Path) -> None:
         axis.set_xlabel("agents")
         axis.set_title(title)
     axes[0].set_ylabel("relative overestimation (%)")
+    axes[0].set_ylim(top=1.3 * axes[0].get_ylim()[1])  # room for the legend
     axes[0].legend(frameon=False, loc="upper left")
     figures.save(figure, path)
 
