@@ -11,6 +11,7 @@ import importlib.metadata
 import math
 import os
 import shutil
+import signal
 import tempfile
 from pathlib import Path
 
@@ -39,6 +40,10 @@ IN_WORKER = "PYTEST_XDIST_WORKER" in os.environ
 
 THREADS = str(4 * max(os.cpu_count(), 2))
 """Of XLA's CPU backend, for the robots that MJX steps on two devices: see `matd3_jax.thread_pool`."""
+
+for name in ("SIGINT", "SIGHUP"):  # ignored in a shell's background and under nohup, and in what is started from there
+    if signal.getsignal(getattr(signal, name)) is signal.SIG_IGN:
+        signal.signal(getattr(signal, name), signal.default_int_handler if name == "SIGINT" else signal.SIG_DFL)
 
 if not IN_WORKER:  # workers get all of it from the process that starts them
     os.environ["NPROC"] = THREADS

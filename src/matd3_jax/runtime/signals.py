@@ -1,4 +1,4 @@
-"""SIGINT, SIGTERM and SIGHUP as a wish to stop soon, but for those that whoever started the program has it ignore."""
+"""SIGINT, SIGTERM and SIGHUP as a wish to stop soon."""
 
 import signal
 import sys
@@ -13,7 +13,8 @@ NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
 class Stop:
     """The signals end the run after the interval at work; a second one ends it at once.
 
-    What is ignored already stays so: SIGHUP under nohup, SIGINT in the background of a script.
+    Under nohup, which has a program ignore SIGHUP, it stays ignored. SIGINT, which shells have what they start in the
+    background ignore, is heeded there, too.
     """
 
     def __init__(self) -> None:
@@ -23,7 +24,7 @@ class Stop:
         threading.Thread(target=self._tell, daemon=True).start()
         for name in NAMES:
             number = getattr(signal, name, None)
-            if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+            if number is not None and not (name == "SIGHUP" and signal.getsignal(number) is signal.SIG_IGN):
                 signal.signal(number, self._remember)
 
     def agreed(self, processes: Processes) -> signal.Signals | None:
