@@ -14,7 +14,7 @@ EXIT_CODE = 130
 def ends_at_once() -> Iterator[None]:
     """Have Ctrl-C end the process while modules are imported, when nothing is written yet.
 
-    KeyboardInterrupt is no help there: packages turn it into errors of their own, or go on without a module.
+    KeyboardInterrupt could be lost there: a package may catch it, or turn it into an error of its own.
     """
     # Only Python's own handler gives way: not one that ignores the signal, nor the handler of a program around this.
     here = threading.current_thread() is threading.main_thread()  # no other may set handlers
