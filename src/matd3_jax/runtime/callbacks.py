@@ -1,6 +1,5 @@
 """What is raised in callbacks, where Python can do no more than print it."""
 
-import _thread
 import signal
 import sys
 import threading
@@ -30,12 +29,21 @@ def handle_errors() -> None:
         if number is None:
             before(found)
             return
-        timer = threading.Timer(_PAUSE, _thread.interrupt_main, (number,))
+        timer = threading.Timer(_PAUSE, _again, (number,))
         timer.daemon = True
         timer.start()
 
     hook.handles_errors = True  # type: ignore[attr-defined]
     sys.unraisablehook = hook
+
+
+def _again(number: int) -> None:
+    """Send the main thread a signal, which wakes it where the system can."""
+    main = threading.main_thread().ident
+    if main is not None and hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(main, number)
+    else:
+        signal.raise_signal(number)
 
 
 def _signal(error: object) -> int | None:
