@@ -3,13 +3,13 @@
 The paper reports it in one sentence, without a figure. Cooperative Navigation with 2 to 6 agents, MADDPG and MATD3.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from scipy import stats
 
-from experiments import figures, markdown, study, verdict
+from experiments import figures, markdown, overestimation, study, verdict
 from experiments.overestimation import beyond, last_two_thirds, measured
 from experiments.study import Study, StudyOptions
 from experiments.tidy import Table
@@ -21,11 +21,6 @@ NUMBERS = {"paper": (2, 3, 4, 5, 6), "small": (2, 3, 4)}
 MARGIN = 0.025
 """Change of the relative overestimation with each agent more that counts as none: a tenth of the true value from 2 to
 6."""
-
-KEYS = {
-    "env": "env.name", "algo": "algo.name", "num_agents": "env.num_agents",
-    "tau": "algo.tau", "gamma": "algo.gamma", "d": "algo.policy_delay",
-}  # fmt: skip
 
 SCALES = {
     "paper": ["seeds=5", "total_steps=1500000", "log_every=12500", "eval_every=50000"],
@@ -45,24 +40,34 @@ def settings(scale: str, options: StudyOptions) -> dict[str, list[str]]:
 def relative(table: Table, algo: str) -> dict[int, np.ndarray]:
     """For each number of agents (estimate - true value) / |true value|, [seeds]: means over agents and evaluations
     after the first update, the quotient of the means."""
-    found = {}
-    for number in table.values("num_agents"):
-        values = measured(table.where(algo=algo, num_agents=number))
-        if values is not None:
-            _, estimate, truth = values
-            found[int(number)] = (estimate - truth).mean(axis=1) / np.abs(truth).mean(axis=1)
-    return found
+
+    def of(part: Table) -> np.ndarray | None:
+        values = measured(part)
+        if values is None:
+            return None
+        _, estimate, truth = values
+        return (estimate - truth).mean(axis=1) / np.abs(truth).mean(axis=1)
+
+    return _by_number(table, algo, of)
 
 
 def relative_beyond(table: Table, algo: str) -> dict[int, np.ndarray]:
     """`relative` over the last two thirds of training, without what the targets' slow start explains."""
-    found = {}
-    for number in table.values("num_agents"):
-        part = table.where(algo=algo, num_agents=number)
+
+    def of(part: Table) -> np.ndarray | None:
         values, rest = measured(part), beyond(part)
-        if values is not None and rest is not None:
-            found[int(number)] = rest / np.abs(last_two_thirds(values[2])).mean(axis=1)
-    return found
+        if values is None or rest is None:
+            return None
+        return rest / np.abs(last_two_thirds(values[2])).mean(axis=1)
+
+    return _by_number(table, algo, of)
+
+
+def _by_number(table: Table, algo: str, of: Callable[[Table], np.ndarray | None]) -> dict[int, np.ndarray]:
+    """What `of` makes of the rows of each number of agents, where it makes something."""
+    numbers = [int(number) for number in table.values("num_agents")]
+    found = {number: of(table.where(algo=algo, num_agents=number)) for number in numbers}
+    return {number: values for number, values in found.items() if values is not None}
 
 
 def claims(table: Table) -> list[Claim]:
@@ -135,7 +140,7 @@ STUDY = Study(
     "agents is the slope of a least-squares line over all seeds. The lag is what is left of the critics' start at zero "
     "while the targets move (see the overestimation experiment).",
     settings=settings,
-    keys=KEYS,
+    keys={**overestimation.STUDY.keys, "num_agents": "env.num_agents"},
     claims=claims,
     draw=draw,
     details=details,
