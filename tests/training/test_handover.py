@@ -1,5 +1,7 @@
 """One agent that begins with the networks of a team's agents (init= of single-agent algorithms)."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -203,3 +205,25 @@ def test_whose_critics_see_more_than_the_one_agent_s(tmp_path):
         else:
             columns = handover.critic_columns("init=x", team, there, here, 1)
             assert columns == [list(range(here.observation_size + here.action_size))] * 2
+
+
+@pytest.mark.parametrize("env", ["simple_tag", "simple_crypto"])
+def test_both_teams_may_be_joined(env):
+    """Each agent's critic finds the numbers that it saw, among them those of the other team's agents."""
+    env = envs.make(env)
+    both = {team: Algorithm(joint=True) for team in set(env.teams)}
+    there = JointLayout.of(env, {team: Algorithm() for team in both})
+    joint = functools.reduce(JointTeam, both, env)
+    here = JointLayout.of(joint, both)
+    rng = np.random.default_rng(1)
+    seen = {name: rng.normal(size=n) for name, n in zip(there.agents, there.observation_sizes, strict=True)}
+    acted = {name: rng.normal(size=space.size) for name, space in zip(there.agents, there.action_spaces, strict=True)}
+    members = {team: [a for a, of in zip(there.agents, there.teams, strict=True) if of == team] for team in both}
+    inputs = np.concatenate([part[a] for part in (seen, acted) for one in here.agents for a in members[one]])
+    wanted = np.concatenate([part[a] for part in (seen, acted) for a in there.agents])
+    for one, name in enumerate(here.agents):
+        team = handover.Team.of("init=x", name, there, env)
+        columns = handover.critic_columns("init=x", team, there, here, one)
+        assert len(columns) == len(members[name])
+        for own in columns:
+            np.testing.assert_array_equal(inputs[own], wanted)

@@ -202,6 +202,15 @@ def test_a_sweep_of_them_is_that_of_runs_alone(tmp_path):
     assert not (tmp_path / "swept" / "batches").exists() or not list((tmp_path / "swept" / "batches").iterdir())
 
 
+def test_both_teams_may_be_handed_over(tmp_path, capsys):
+    """Without adversary= the opponents are a hybrid, too."""
+    given = [*TINY[3:], "env=simple_adversary", "algo=hybrid", "total_steps=700", f"out={tmp_path}", "name=run"]
+    assert train.main(given) == 0
+    table = rows(tmp_path / "run")
+    assert {"agents_return", "adversaries_critic_loss"} <= table[0].keys() and int(table[-1]["step"]) == 790
+    assert all(np.isfinite(float(table[-1][f"{team}_critic_loss"])) for team in ("agents", "adversaries"))
+
+
 def test_where_all_seeds_diverge_it_ends_there(tmp_path):
     """Before the switch: the one agent takes over where they stopped, and nobody is left to train."""
     given = [

@@ -146,13 +146,12 @@ def critic_columns(source: str, team: Team, there: JointLayout, here: JointLayou
         start = observations + (here.action_starts[one] if central else 0) + action
         place[agent] = ([actions + entry for entry in entries], list(range(start, start + size)))
         action += size
-    for agent, name in enumerate(there.agents):
+    for agent in range(there.num_agents):
         if agent not in place and central:
-            other = here.agents.index(name)
-            start = here.observation_starts[other]
-            seen = list(range(start, start + here.observation_sizes[other]))
-            start = observations + here.action_starts[other]
-            place[agent] = (seen, list(range(start, start + here.action_spaces[other].size)))
+            seen, acted = _start(there, here, agent)
+            size = there.action_spaces[agent].size
+            start = observations + acted
+            place[agent] = ([*range(seen, seen + there.observation_sizes[agent])], [*range(start, start + size)])
     found = []
     for agent in team.agents:
         read = range(there.num_agents) if there.algorithms[agent].central else [agent]
@@ -163,6 +162,20 @@ def critic_columns(source: str, team: Team, there: JointLayout, here: JointLayou
             )
         found.append([column for part in (0, 1) for i in read for column in place[i][part]])
     return found
+
+
+def _start(there: JointLayout, here: JointLayout, agent: int) -> tuple[int, int]:
+    """Where the observation and the action of an agent of `there` begin in the joint ones of `here`, where another
+    agent may have taken the place of its team, too."""
+    if there.agents[agent] in here.agents:
+        i, before = here.agents.index(there.agents[agent]), []
+    else:
+        i = here.agents.index(there.teams[agent])
+        before = [k for k in range(agent) if there.teams[k] == there.teams[agent]]
+    return (
+        here.observation_starts[i] + sum(there.observation_sizes[k] for k in before),
+        here.action_starts[i] + sum(there.action_spaces[k].size for k in before),
+    )
 
 
 def networks(
