@@ -16,6 +16,7 @@ from experiments import tidy
 from experiments.tidy import Table
 from matd3_jax import config
 from matd3_jax.config import Config
+from matd3_jax.config.diff import text
 from matd3_jax.config.schema import UNREPORTED
 from matd3_jax.errors import UserError
 from matd3_jax.runs.directory import RunDirectory
@@ -160,7 +161,8 @@ def check(path: Path, wanted: Config) -> None:
     """Raise UserError if the run at `path` was made with other settings."""
     other = differences(RunDirectory.open(path)[1].to_dict(), wanted.to_dict())
     if other:
-        words = ", ".join(f"{key} {was} there, {asked} here" for key, (was, asked) in list(other.items())[:3])
+        first = list(other.items())[:3]
+        words = ", ".join(f"{key} {text(was)} there, {text(asked)} here" for key, (was, asked) in first)
         raise UserError(f"{path} was made with other settings ({words}): remove it, or choose another runs=")
 
 

@@ -21,6 +21,7 @@ from matd3_jax import config
 from matd3_jax.cli.command import line as line_to_copy
 from matd3_jax.cli.options import Command, asks_for_help, key, option, others
 from matd3_jax.config import Config
+from matd3_jax.config.diff import text
 from matd3_jax.errors import UserError
 from matd3_jax.runs.paths import check_directory
 from matd3_jax.runtime import devices, files
@@ -270,7 +271,7 @@ def departures(study: Study, data: Data, options: StudyOptions) -> list[str]:
             protocol = _load(tuple(paper[label]))
             other = collecting.differences(fact["settings"], protocol.to_dict())
             other = {key: pair for key, pair in other.items() if not key.startswith("adversary.")} or other
-            differences += [f"{key} {was} ({asked})" for key, (was, asked) in other.items()]
+            differences += [f"{key} {text(was)} ({text(asked)})" for key, (was, asked) in other.items()]
             seeds = len(data.seeds(label))
             differences += [f"seeds {seeds} ({protocol.seeds})"] if seeds != protocol.seeds else []
         if differences:

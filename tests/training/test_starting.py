@@ -265,7 +265,7 @@ N = ["normalize_observations=true", "normalize_least_deviation=0.2"]
 SAME = [*N, "algo.hidden=[7]", "adversary=maddpg", "adversary.hidden=[6,5]"]
 BAD = {
     "init=nowhere": "init=nowhere: there is no run directory nowhere",
-    "init=SOURCE": "init=SOURCE: its networks were trained with normalize_observations=True; normalize_obs",
+    "init=SOURCE": "init=SOURCE: its networks were trained with normalize_observations=true; normalize_obs",
     "init=SOURCE init_checkpoint=7 " + " ".join(N): "holds no checkpoint of step 7",
     "init=SOURCE init_seed=4 " + " ".join(SAME): "init_seed=4: the seeds of SOURCE are 5 to 6",
     "init=SOURCE " + " ".join([*SAME[:2], *SAME[3:]]):

@@ -9,6 +9,7 @@ import numpy as np
 
 from matd3_jax import envs
 from matd3_jax.config import Config
+from matd3_jax.config.diff import text
 from matd3_jax.envs.environment import Environment
 from matd3_jax.errors import UserError
 from matd3_jax.evaluation import cross_play
@@ -97,7 +98,8 @@ def _check_same(env: Environment, first: Config, a: Path, other: Environment, se
             (s.env.get("name") if name == "name" else getattr(e, name)) for s, e in ((first, env), (settings, other))
         )
         if one != two:
-            raise UserError(f"runs of different environments cannot meet: env.{name}={one} in {a}, {two} in {b}")
+            here, there = text(one), text(two)
+            raise UserError(f"runs of different environments cannot meet: env.{name}={here} in {a}, {there} in {b}")
 
 
 def play(

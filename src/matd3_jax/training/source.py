@@ -10,6 +10,7 @@ import numpy as np
 
 from matd3_jax import envs
 from matd3_jax.config import Config
+from matd3_jax.config.diff import text
 from matd3_jax.config.schema import AlgoConfig
 from matd3_jax.core import sharing
 from matd3_jax.core.agents import JointLayout
@@ -285,7 +286,8 @@ def _check_normalization(settings: Config, source: Source) -> None:
     for key in ("normalize_observations", "normalize_least_deviation"):
         here, there = getattr(settings, key), getattr(source.settings, key)
         if here != there:
-            raise UserError(f"{source.name}: its networks were trained with {key}={there}; {key}={here} here")
+            was, now = text(there), text(here)
+            raise UserError(f"{source.name}: its networks were trained with {key}={was}; {key}={now} here")
 
 
 def _paths(tree: Any) -> Iterator[tuple[str, Any]]:
