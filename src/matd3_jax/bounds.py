@@ -42,7 +42,7 @@ class Bounds(NamedTuple):
             return f"be one of {', '.join(map(str, self.choices))}"
         if self.least is not None and self.most is not None:
             return f"{f'be {noun} from' if noun else 'lie between'} {self.least} {'to' if noun else 'and'} {self.most}"
-        if self.above == 0:
+        if self.above == 0 and self.most is None:
             return f"be {noun.replace('a ', 'a positive ', 1)}" if noun else "be positive"
         if self.least == 0 and not noun:
             return "not be negative"

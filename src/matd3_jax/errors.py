@@ -8,7 +8,7 @@ class UserError(ValueError):
     """A setting, file or directory that will not do; its message is one line that says why and what would."""
 
 
-class OptionError(ValueError):
+class OptionError(UserError):
     """A name or an option that no environment takes; the message names the key, the value and what is allowed."""
 
 

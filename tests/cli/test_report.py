@@ -259,7 +259,13 @@ def test_films_are_inside_found_or_made(tmp_path):
         ["env=simple_tag", "algo=matd3", "adversary=maddpg", "adversary.lr=0.02", "seeds=2", "algo.hidden=[32,16]"],
         ["env=ant", "recipe=paper", "env.physics=mjx", "n_step=3", "algo.exploration_noise=[0.1,0.4]"],
         ["env=half_cheetah", "logger=[csv,wandb]", "wandb.project='a b, c'", "wandb.mode=offline", "name=x y"],
-        ["env=simple_spread", "mlflow.tracking_uri='it\\'s/here'", "eval_every=null", "checkpoint_minutes=2.5"],
+        [
+            "env=simple_spread",
+            "logger=mlflow",
+            "mlflow.tracking_uri='it\\'s/here'",
+            "eval_every=null",
+            "checkpoint_minutes=2.5",
+        ],
     ],
 )
 def test_the_command_gives_the_settings_again(words):

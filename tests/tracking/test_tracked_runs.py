@@ -41,9 +41,9 @@ pytestmark = [
 def trained(tmp_path_factory) -> Path:
     """A run with trackers and films, and one without; the first resumed from its middle, and lengthened."""
     out = tmp_path_factory.mktemp("runs")
-    where = [f"out={out}", f"mlflow.tracking_uri='{out / 'tracks'}'"]
-    assert train.main([*TINY, *where, "name=plain"]) == 0
-    assert train.main([*TINY, *TRACKED, *where, "name=tracked"]) == 0
+    assert train.main([*TINY, f"out={out}", "name=plain"]) == 0
+    uri = f"mlflow.tracking_uri='{out / 'tracks'}'"
+    assert train.main([*TINY, *TRACKED, f"out={out}", uri, "name=tracked"]) == 0
     return out
 
 

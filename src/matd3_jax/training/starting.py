@@ -14,8 +14,9 @@ import numpy as np
 
 from matd3_jax import config as configuration
 from matd3_jax.config import Config
+from matd3_jax.config.diff import differing, text
 from matd3_jax.errors import UserError
-from matd3_jax.runs.directory import START
+from matd3_jax.runs.directory import START, RunDirectory
 from matd3_jax.runtime import files
 from matd3_jax.runtime.multihost import Share
 from matd3_jax.training.state import TrainState
@@ -46,21 +47,35 @@ def lines(settings: Config) -> list[str]:
     if settings.init is not None:
         found.append(
             f"begins with the networks and statistics of {settings.init} "
-            f"({_which(settings.init_checkpoint)}); optimizers and replay are fresh"
+            f"({_which(settings.init_checkpoint)}{_elsewhere(settings, settings.init)}); optimizers and replay are "
+            "fresh"
         )
     for team, algo in settings.teams().items():
         if algo.frozen:
-            found.append(f"{team} play the policy of {algo.policy} ({_which(algo.policy_checkpoint)}) and do not learn")
+            which = f"{_which(algo.policy_checkpoint)}{_elsewhere(settings, str(algo.policy))}"
+            found.append(f"{team} play the policy of {algo.policy} ({which}) and do not learn")
     return found
+
+
+def _elsewhere(settings: Config, path: str) -> str:
+    """In what environment another run learned, where it is not this one's."""
+    try:
+        there = RunDirectory.open(Path(path))[1].env
+    except UserError:  # resumed, a run needs the other no more
+        return ""
+    if there["name"] != settings.env["name"]:
+        return f"; learned in {there['name']}"
+    other = differing([there, settings.env])
+    return f"; learned with {', '.join(f'env.{key}={text(there.get(key))}' for key in other)}" if other else ""
 
 
 def _distills(settings: Config) -> bool:
     return any(team.handover == "distill" for team in settings.teams().values())
 
 
-def _which(text: str | None) -> str:
+def _which(given: str | None) -> str:
     return {None: "last checkpoint", "last": "last checkpoint", "best": "best evaluations"}.get(
-        text, f"env step {text}"
+        given, f"env step {given}"
     )
 
 

@@ -13,8 +13,10 @@ from matd3_jax.config import Config
 from matd3_jax.config.schema import TEXTS
 from matd3_jax.envs.check import check
 from matd3_jax.envs.environment import Environment
+from matd3_jax.runs.directory import RunDirectory
 from matd3_jax.runtime import devices
 from matd3_jax.training import outputs
+from matd3_jax.training.given_environment import check_options, check_same, recorded
 from matd3_jax.training.loggers import CallbackLogger, DivergenceLogger, HistoryLogger, Logger, warn
 from matd3_jax.training.rows import Row
 from matd3_jax.training.run import Outcome, run
@@ -22,6 +24,7 @@ from matd3_jax.training.session import TrainingSession
 from matd3_jax.training.state import TrainState
 
 if TYPE_CHECKING:
+    from matd3_jax.export.write import Exported
     from matd3_jax.training.recorded_run import Recorded
     from matd3_jax.training.recording import Recorder
 
@@ -46,6 +49,17 @@ class Result:
         """Undiscounted returns [seeds, episodes, agents] of whole episodes (see `TrainingSession.evaluate`)."""
         return self.training.evaluate(self.state, episodes, deterministic, seed).episode_return
 
+    @devices.standard_numerics()
+    def export(self, out: str | Path, format: str = "numpy", seed: int | None = None) -> "Exported":
+        """Write each agent's deterministic policy of one seed (default: the first) into a new directory, as the command
+        `export` does (see `export.write.export`)."""
+        from matd3_jax.export.write import export
+        from matd3_jax.training.saved_policies import SavedPolicies
+
+        steps = self.metrics["step"][:, -1].astype(int)
+        saved = SavedPolicies(self.state, steps, self.training.finite(self.state), {})
+        return export(self.training, saved, self.config.seed if seed is None else seed, format, Path(out))
+
 
 @devices.standard_numerics()
 def train(
@@ -63,7 +77,7 @@ def train(
     single values as strings: `train("algo.lr=0.003", "env.num_good=2", ...)`.
 
     Args:
-        env: a name, or an `Environment` of your own.
+        env: a name, or an `Environment` of your own, which has its options already.
         run_dir: a directory to be made, with everything that the command leaves in one: settings, metrics, checkpoints,
             figures, summary; `resume` trains the run on. None: no files are written.
         callback: called with every interval's row (columns [seeds]) as it comes.
@@ -89,9 +103,11 @@ def train(
         check(own)
     given = {key: value for key, value in settings.items() if value is not None or key not in TEXTS}
     chosen = [f"algo={algo}", *(f"{key}={_text(value)}" for key, value in given.items()), *overrides]
+    if own is not None:
+        check_options(own, chosen)
     config = configuration.load(chosen if own is not None else [f"env={env}", *chosen])
     if own is not None:
-        config = dataclasses.replace(config, env={"name": type(own).__name__})
+        config = dataclasses.replace(config, env=recorded(own))
     if run_dir is not None:
         return _result(_recorder(loggers, callback).start(config, Path(run_dir), own))
     if config.hands_over:  # the one agent begins with a checkpoint of the agents
@@ -129,7 +145,7 @@ def resume(
         run_dir: the run's directory, made by `train(run_dir=...)` or by the command.
         checkpoint: the env step of an older checkpoint to resume from.
         total_steps: env steps of each seed from now on; None: as before.
-        env: the environment of a run that was given one as an object.
+        env: the environment of a run that was given one as an object, with the same options.
         unpickle: let environments on the host go on from what the run pickled (`env.pickle=true`); what is unpickled
             can run any program, so that the directory must be one to trust. Otherwise they start new episodes.
         callback, loggers: get the rows to come (see `train`).
@@ -139,6 +155,7 @@ def resume(
     devices.prepare()
     if env is not None:
         check(env)
+    check_same(RunDirectory.open(Path(run_dir))[1].env, env, run_dir)
     return _result(_recorder(loggers, callback).resume(Path(run_dir), checkpoint, total_steps, env, unpickle))
 
 
