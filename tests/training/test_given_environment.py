@@ -7,6 +7,7 @@ import pytest
 
 import matd3_jax
 from matd3_jax import config, envs
+from matd3_jax.cli import check, evaluate
 from matd3_jax.envs.point_reach import PointReach
 from matd3_jax.errors import OptionError, UserError
 from matd3_jax.export.numpy_reader import load as read_policies
@@ -101,3 +102,19 @@ def test_trackers_settings_go_with_their_logger():
         with pytest.raises(UserError, match=rf"^{line}: goes with logger=\[csv,{group}\]$"):
             config.load([line])
         assert config.load([line, f"logger={group}"]).logger == ("csv", group)
+
+
+def test_commands_say_where_such_a_run_goes_on(run, capsys):
+    assert check.main([f"run={run.run_dir}"]) == 0
+    line = rf"finished; train it on from Python: matd3_jax.resume('{run.run_dir}', env=PointReach(...), total_steps=N)"
+    assert capsys.readouterr().out.splitlines()[-1] == line
+    with pytest.raises(
+        UserError, match="^no environment is called 'PointReach': one that was given as an object takes"
+    ):
+        evaluate.main([f"run={run.run_dir}"])
+
+
+@pytest.mark.parametrize("setting", ["name=x", "checkpoint_every=100", "video_every=100", "logger=tensorboard"])
+def test_without_a_directory_nothing_is_left(setting):
+    with pytest.raises(UserError, match=r"needs a run directory: give run_dir=$"):
+        matd3_jax.train(setting, env="point_reach", **SMALL)

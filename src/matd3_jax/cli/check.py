@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from matd3_jax import envs
 from matd3_jax.cli import catalog, command
 from matd3_jax.cli.sweep import open_sweep
 from matd3_jax.errors import UserError
@@ -81,7 +82,7 @@ def _tell(lines: Sequence[str], problems: Sequence[str]) -> None:
 
 
 def _way_on(found: Condition) -> str:
-    path = found.run.path
+    path, env = found.run.path, found.settings.env["name"]
     if found.holder is not None:
         return f"wait for its end, or stop it: {found.holder} works in it"
     if found.damaged and not found.whole:
@@ -89,6 +90,10 @@ def _way_on(found: Condition) -> str:
             f"no checkpoint can be read: take {found.run.checkpoints} away and train from the start with: "
             f"{command.line('matd3_jax.train', resume=path)}"
         )
+    if env not in envs.names() and (found.whole or found.run.sweep is None):
+        more = ", total_steps=N" if found.finished else ""
+        state = "finished; train it on" if found.finished else "resume it"
+        return f"{state} from Python: matd3_jax.resume({str(path)!r}, env={env}(...){more})"
     if found.finished and not found.needs_step:
         return f"finished; evaluate with: {command.line('matd3_jax.evaluate', run=path)}"
     if not found.whole and found.run.sweep is not None:

@@ -23,12 +23,14 @@ Tell = Callable[[str], object]
 def check(settings: Config, recorded: bool = True) -> None:
     """Raise UserError where a logger cannot be had: its package is missing, or there is no run directory.
 
-    recorded: whether the run leaves one.
+    recorded: whether the run leaves one, which films and checkpoints need, too.
     """
     more = [name for name in settings.logger if name != "csv"]
-    if not recorded and (more or settings.video_every):
-        what = f"logger=[{','.join(more)}]" if more else f"video_every={settings.video_every}"
-        raise UserError(f"{what} needs a run directory: give run_dir=")
+    asked = [f"logger=[{','.join(more)}]"] if more else []
+    for key in ("video_every", "checkpoint_every", "name"):
+        asked += [f"{key}={getattr(settings, key)}"] if getattr(settings, key) else []
+    if asked and not recorded:
+        raise UserError(f"{asked[0]} needs a run directory: give run_dir=")
     for name in more:
         if name == "tensorboard":
             TensorBoardLogger.check()

@@ -17,6 +17,7 @@ from matd3_jax.core.algorithm import HyperParams
 from matd3_jax.core.q_bias import Values
 from matd3_jax.core.rollout import Evaluation
 from matd3_jax.envs.environment import Environment
+from matd3_jax.errors import UserError
 from matd3_jax.runs import overestimation
 from matd3_jax.runs.missing import Expected
 from matd3_jax.runtime import devices
@@ -65,7 +66,7 @@ class TrainingSession:
         """Which of the seeds are trained in this process."""
         self.seeds = numbers[self.share.seeds]
         """[seeds] the number that each seed's key is made from."""
-        self.env, algorithms = teams.joined(config, envs.make(**config.env) if env is None else env)
+        self.env, algorithms = teams.joined(config, _made(config) if env is None else env)
         sequences = (config.sequence_length, config.burn_in) if config.recurrent else (1, 0)
         self.layout = JointLayout.of(self.env, algorithms, config.n_step, *sequences)
         schedule = Schedule.of(config)
@@ -287,3 +288,14 @@ class TrainingSession:
         if found is not None:
             found = Values(*(leaf[..., np.array(self.layout.learners)] for leaf in found))
         return state, overestimation.columns(self.layout.learning_agents, found, len(self.seeds))
+
+
+def _made(config: Config) -> Environment:
+    """The environment that the settings name. Raises UserError where a run was given one as an object."""
+    name = config.env["name"]
+    if name not in envs.names():
+        raise UserError(
+            f"no environment is called {name!r}: one that was given as an object takes Python, "
+            f"matd3_jax.resume(RUN_DIR, env={name}(...))"
+        )
+    return envs.make(**config.env)
