@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import matd3_jax
-from matd3_jax import config, envs
+from matd3_jax import envs
 from matd3_jax.cli import check, evaluate
 from matd3_jax.envs.point_reach import PointReach
 from matd3_jax.errors import OptionError, UserError
@@ -95,13 +95,6 @@ def test_errors_of_options_are_the_user_s_to_mend():
     with pytest.raises(UserError, match="no environment is called"):
         envs.make("simple_spred")
     assert issubclass(OptionError, UserError)
-
-
-def test_trackers_settings_go_with_their_logger():
-    for group, line in (("wandb", "wandb.project=mine"), ("mlflow", "mlflow.experiment=mine")):
-        with pytest.raises(UserError, match=rf"^{line}: goes with logger=\[csv,{group}\]$"):
-            config.load([line])
-        assert config.load([line, f"logger={group}"]).logger == ("csv", group)
 
 
 def test_commands_say_where_such_a_run_goes_on(run, capsys):

@@ -11,7 +11,7 @@ import numpy as np
 from matd3_jax import config
 from matd3_jax.cli import catalog, command, options
 from matd3_jax.cli.arguments import Sweep as SweepOptions
-from matd3_jax.config import Config
+from matd3_jax.config import Config, effect
 from matd3_jax.errors import UserError, nearest
 from matd3_jax.figures import lineage as lineage_figure
 from matd3_jax.figures import sweep as sweep_figure
@@ -161,6 +161,7 @@ def read(
         except UserError as error:
             swept = ", ".join(f"{key}={value}" for key, value in values.items())
             raise UserError(f"{error} (with {swept})" if values else str(error)) from error
+    effect.check(overrides, settings.values())
     batching.check_seeds(settings)
     return chosen, settings
 

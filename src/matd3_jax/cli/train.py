@@ -6,7 +6,7 @@ from pathlib import Path
 
 from matd3_jax import config
 from matd3_jax.cli import arguments, catalog, command, options
-from matd3_jax.config import Config, diff
+from matd3_jax.config import Config, diff, effect
 from matd3_jax.errors import UserError
 from matd3_jax.runs.paths import as_part, inside
 from matd3_jax.runtime import devices, multihost, slurm
@@ -53,6 +53,7 @@ def _train(recorder: Recorder, given: arguments.Train) -> Recorded:
     if given.checkpoint is not None:
         raise UserError("checkpoint= goes with resume=RUN_DIR")
     settings = config.load(given.settings, catalog.TRAIN.keys)
+    effect.check(given.settings, [settings])
     name = settings.name or _name(settings)
     return recorder.start(settings, inside(Path(settings.out), name, "name"), or_another=not settings.name)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from matd3_jax import config as configuration
-from matd3_jax.config import Config
+from matd3_jax.config import Config, effect
 from matd3_jax.config.schema import TEXTS
 from matd3_jax.envs.check import check
 from matd3_jax.envs.environment import Environment
@@ -106,6 +106,7 @@ def train(
     if own is not None:
         check_options(own, chosen)
     config = configuration.load(chosen if own is not None else [f"env={env}", *chosen])
+    effect.check(chosen, [config])
     if own is not None:
         config = dataclasses.replace(config, env=recorded(own))
     if run_dir is not None:
