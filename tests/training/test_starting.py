@@ -1,6 +1,7 @@
 """Runs that begin with networks of others (init=), and that play against their frozen teams (adversary.policy=)."""
 
 import csv
+import dataclasses
 import json
 import shutil
 
@@ -75,6 +76,20 @@ def test_a_frozen_team_has_the_settings_of_its_run(fighting, source):
     there, here = config.read(source / "config.yaml").adversary, config.read(fighting / "config.yaml").adversary
     assert here.name == "maddpg" and here.hidden == (6, 5) and here.frozen and not there.frozen
     assert here.actor_average == 0.3 and here.policy.endswith("/source")
+
+
+def test_where_its_policy_learned_is_said_where_it_was_elsewhere(source):
+    """Also of networks that a run begins with."""
+    settings = against(source, f"init={source}")
+    name, length = settings.env["name"], settings.env["episode_length"]
+    elsewhere = [
+        (settings.env, "last checkpoint)"),
+        ({**settings.env, "name": "simple_push"}, f"last checkpoint; learned in {name})"),
+        ({**settings.env, "episode_length": 9}, f"last checkpoint; learned with env.episode_length={length})"),
+    ]
+    for env, words in elsewhere:
+        found = starting.lines(dataclasses.replace(settings, env=env))
+        assert len(found) == 2 and all(words in line for line in found)
 
 
 def test_its_networks_are_the_evaluated_ones_of_the_run_and_never_change(fighting, source):

@@ -14,7 +14,6 @@ from matd3_jax.errors import UserError
 UNWRITABLE = re.compile(r" at 0x[0-9a-f]+|\$\{")
 """In what Python says of an object that does not describe itself, and what a settings file would look up."""
 
-
 LONGEST = 1_000
 """Characters of an option that are worth keeping: arrays are not."""
 

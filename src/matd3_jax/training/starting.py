@@ -65,8 +65,8 @@ def _elsewhere(settings: Config, path: str) -> str:
         return ""
     if there["name"] != settings.env["name"]:
         return f"; learned in {there['name']}"
-    other = differing([there, settings.env])
-    return f"; learned with {', '.join(f'env.{key}={text(there.get(key))}' for key in other)}" if other else ""
+    other = [key for key in differing([there, settings.env]) if key in there and key in settings.env]
+    return f"; learned with {', '.join(f'env.{key}={text(there[key])}' for key in other)}" if other else ""
 
 
 def _distills(settings: Config) -> bool:
